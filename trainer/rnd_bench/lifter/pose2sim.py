@@ -5,6 +5,7 @@ Source: Hartley and Zisserman 2004, Multiple View Geometry, 12.2 (linear triangu
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -23,6 +24,8 @@ from .figures import BODY, LIMBS, angles, placed, procrustes, root_relative
 Floats = NDArray[np.float64]
 
 SCORED = ("cam01", "cam03")
+EVERY = 2
+"""frames of the videos per frame looked at"""
 _REST_WIDTHS = {"hip": 2 * 0.086, "shoulder": 2 * (0.076 + 0.114)}  # m, of REST_OFFSETS
 _REST_TRUNK = 0.457  # m, from the middle of the hips to that of the shoulders
 _UNIT = 64.0  # of the file's intrinsics, a pixel
@@ -84,6 +87,31 @@ def triangulated(cameras: list[Calibrated], rays: Floats, confidence: Floats) ->
     return found
 
 
+def watched(
+    folder: Path, out: Path, points: Sequence[str]
+) -> tuple[dict[str, Calibrated], dict[str, Observations], dict[str, NDArray[np.int64]], Floats]:
+    """Cameras, their observations of every ``EVERY``-th frame, and what all saw at once, by triangulation.
+
+    Args:
+        folder: Pose2Sim's Demo_SinglePerson.
+        out: folder in which observations are kept.
+        points: P names of BlazePose's points.
+
+    Returns:
+        By camera: calibration, observations, and rows [T] of the frames that all share; the points [T, P, 3] m in the
+        file's world, NaN where they are unknown.
+    """
+    cameras = load_cameras(folder / "calibration" / "Calib.qca.txt")
+    names = sorted(cameras)
+    seen = {name: observed(folder / "videos" / f"{name}.mp4", out / f"{name}.npz", EVERY) for name in names}
+    shared = sorted(set.intersection(*(set(one.frames.tolist()) for one in seen.values())))
+    rows = {name: np.searchsorted(seen[name].frames, shared) for name in names}
+    chosen = [BLAZEPOSE.index(point) for point in points]
+    rays = np.stack([cameras[n].undistorted(seen[n].keypoints_px[rows[n]][:, chosen].astype(float)) for n in names])
+    confidence = np.stack([seen[n].confidence[rows[n]][:, chosen] for n in names]).astype(np.float64)
+    return cameras, seen, rows, triangulated([cameras[n] for n in names], rays, confidence)
+
+
 def figures_of_cameras(folder: Path, network: Path, out: Path) -> list[dict[str, object]]:
     """Rows of the scored cameras: the lifter and the landmark network against the triangulated points.
 
@@ -94,7 +122,7 @@ def figures_of_cameras(folder: Path, network: Path, out: Path) -> list[dict[str,
     cameras = load_cameras(folder / "calibration" / "Calib.qca.txt")
     names = sorted(cameras)
     seen: dict[str, Observations] = {
-        name: observed(folder / "videos" / f"{name}.mp4", out / f"{name}.npz", every=2) for name in names
+        name: observed(folder / "videos" / f"{name}.mp4", out / f"{name}.npz", EVERY) for name in names
     }
     rays = np.stack([cameras[n].undistorted(seen[n].keypoints_px.astype(np.float64)) for n in names])
     points = triangulated([cameras[n] for n in names], rays, np.stack([seen[n].confidence for n in names]))

@@ -10,8 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_bench.lifter.captured import observed
-from rnd_bench.lifter.pose2sim import SCORED, Calibrated, load_cameras, triangulated
+from rnd_bench.lifter.pose2sim import SCORED, Calibrated, watched
 from rnd_runtime.capture.capture import Capture, Frame, load_capture, save_capture
 from rnd_runtime.capture.format import Split
 from rnd_runtime.core.arrays import spaced_indices
@@ -19,15 +18,13 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
 from rnd_runtime.motion.motion import Motion
-from rnd_trainer.estimating.observations import BLAZEPOSE, Observations
+from rnd_trainer.estimating.observations import Observations
 from rnd_trainer.importing.images import undistort_image
 from rnd_trainer.importing.videos.video_file import VideoFile
 
 Floats = NDArray[np.float64]
 
 HIPS = ("left_hip", "right_hip")
-EVERY = 2
-"""frames of Pose2Sim's videos per frame looked at"""
 INSTANTS = 5
 """scored by each camera"""
 
@@ -157,18 +154,10 @@ class Filmed:
 
 def other_cameras(folder: Path, out: Path) -> Iterator[tuple[str, Filmed]]:
     """Pose2Sim's scored cameras by name; observations are kept in ``out``."""
-    cameras = load_cameras(folder / "calibration" / "Calib.qca.txt")
-    names = sorted(cameras)
-    seen = {name: observed(folder / "videos" / f"{name}.mp4", out / f"{name}.npz", EVERY) for name in names}
-    shared = sorted(set.intersection(*(set(one.frames.tolist()) for one in seen.values())))
-    rows = {name: np.searchsorted(seen[name].frames, shared) for name in names}
-    hips = [BLAZEPOSE.index(name) for name in HIPS]
-    rays = np.stack([cameras[n].undistorted(seen[n].keypoints_px[rows[n]][:, hips].astype(float)) for n in names])
-    confidence = np.stack([seen[n].confidence[rows[n]][:, hips] for n in names]).astype(np.float64)
-    middle = triangulated([cameras[n] for n in names], rays, confidence).mean(1)
+    cameras, seen, rows, hips = watched(folder, out, HIPS)
     for name in SCORED:
         found = np.full((len(seen[name].frames), 3), np.nan)
-        found[rows[name]] = middle
+        found[rows[name]] = hips.mean(1)
         yield name, Filmed(name, folder, cameras, seen, found)
 
 

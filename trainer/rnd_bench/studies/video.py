@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rnd_bench.lifter.captured import observed
-from rnd_bench.lifter.pose2sim import SCORED, load_cameras, triangulated
+from rnd_bench.lifter.pose2sim import SCORED, watched
 from rnd_runtime.capture.body import posed_vertices
 from rnd_runtime.capture.capture import Capture, load_capture
 from rnd_runtime.cli.progress import Progress
@@ -25,7 +25,7 @@ from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.playback.doctor import machine
 from rnd_trainer.estimating.fit import Estimate, estimate
 from rnd_trainer.estimating.fitting.figure import JOINTS
-from rnd_trainer.estimating.observations import BLAZEPOSE, Observations
+from rnd_trainer.estimating.observations import Observations
 
 from .video_options import Video
 
@@ -93,14 +93,7 @@ def _rendered(capture: Capture, seen: Observations) -> Iterator[dict[str, Any]]:
 
 
 def _real(folder: Path, out: Path) -> Iterator[dict[str, Any]]:
-    cameras = load_cameras(folder / "calibration" / "Calib.qca.txt")
-    names = sorted(cameras)
-    seen = {name: observed(folder / "videos" / f"{name}.mp4", out / f"{name}.npz", 2) for name in names}
-    shared = sorted(set.intersection(*(set(one.frames.tolist()) for one in seen.values())))
-    rows = {name: np.searchsorted(seen[name].frames, shared) for name in names}
-    rays = np.stack([cameras[n].undistorted(seen[n].keypoints_px[rows[n]].astype(np.float64)) for n in names])
-    confidence = np.stack([seen[n].confidence[rows[n]] for n in names]).astype(np.float64)
-    points = triangulated([cameras[n] for n in names], rays, confidence)[:, [BLAZEPOSE.index(n) for n in LIMBS]]
+    cameras, seen, rows, points = watched(folder, out, LIMBS)
     whole = np.isfinite(points).all((1, 2))
     for name in SCORED:
         start = time.process_time()
