@@ -7,6 +7,7 @@ import itertools
 import json
 import shutil
 import subprocess
+import threading
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -132,3 +133,15 @@ def _port(file: Path, process: subprocess.Popen[bytes]) -> int:
         assert process.poll() is None and time.monotonic() < until, "Chromium did not start"
         time.sleep(0.05)
     return int(text.split()[0])
+
+
+@contextmanager
+def answering(server: Any) -> Iterator[None]:
+    """Requests to ``server`` are answered in a thread of its own, to the end of the context."""
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield
+    finally:
+        server.shutdown()
+        thread.join()

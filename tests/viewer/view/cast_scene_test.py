@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 
 import msgspec
@@ -19,7 +18,7 @@ from rnd_viewer.view.scene import Scene
 from rnd_viewer.view.server import serve
 from rnd_viewer.view.state import ViewState
 from support.axe import AXE, violations
-from support.browser import CHROMIUM, chromium
+from support.browser import CHROMIUM, answering, chromium
 from support.paths import ASSETS
 
 SIZE, FRAME, FPS = 160, 12, 30
@@ -95,25 +94,21 @@ def test_a_scene_brings_its_motions(tmp_path):
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_the_page_shows_everybody_under_the_controls_of_one(tmp_path):
     scene = _scene(tmp_path, PERSON + OTHER)
-    with serve(scene, "127.0.0.1", 0, "s3cret") as (server, url), chromium(tmp_path / "profile") as page:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            page.open(url)
-            page.wait("window.rnd && rnd.scene()")
-            assert "2 people" in page.run("document.getElementById('subtitle').textContent")
-            home = page.run("rnd.state.azimuth")
-            page.run(
-                "document.querySelector('[data-preset=side]').click(); document.getElementById('skeleton').click()"
-            )
-            assert page.run("rnd.frame().then(({ joints }) => joints.length)") == len(scene.parents())
-            assert page.run("rnd.state.azimuth") == pytest.approx(home + np.pi / 2)
-            page.run("rnd.play(true)")
-            page.wait("rnd.state.time > 0.2")
-            page.run("rnd.play(false)")
-            assert not AXE.is_file() or violations(page) == []
-            assert page.messages == []
-        finally:
-            server.shutdown()
-            thread.join()
+    with (
+        serve(scene, "127.0.0.1", 0, "s3cret") as (server, url),
+        answering(server),
+        chromium(tmp_path / "profile") as page,
+    ):
+        page.open(url)
+        page.wait("window.rnd && rnd.scene()")
+        assert "2 people" in page.run("document.getElementById('subtitle').textContent")
+        home = page.run("rnd.state.azimuth")
+        page.run("document.querySelector('[data-preset=side]').click(); document.getElementById('skeleton').click()")
+        assert page.run("rnd.frame().then(({ joints }) => joints.length)") == len(scene.parents())
+        assert page.run("rnd.state.azimuth") == pytest.approx(home + np.pi / 2)
+        page.run("rnd.play(true)")
+        page.wait("rnd.state.time > 0.2")
+        page.run("rnd.play(false)")
+        assert not AXE.is_file() or violations(page) == []
+        assert page.messages == []
     scene.close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -17,7 +16,7 @@ from rnd_viewer.view.options import ViewOptions
 from rnd_viewer.view.server import serve
 from rnd_viewer.view.training import POINTS, Training
 from support.axe import AXE, violations
-from support.browser import CHROMIUM, chromium
+from support.browser import CHROMIUM, answering, chromium
 from support.paths import ASSETS
 
 
@@ -77,44 +76,36 @@ def _read(url: str, path: str) -> bytes:
 
 
 def test_the_page_and_previews_are_served_and_nothing_else(run):
-    with serve(Training(ViewOptions(run)), "127.0.0.1", 0, "s3cret") as (server, url):
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            assert b"training.js" in _read(url, "")
-            assert json.loads(_read(url, "training.json"))["previews"] == ["step_000005.png"]
-            assert _read(url, "previews/step_000005.png") == (run / "previews/step_000005.png").read_bytes()
-            for path in ("previews/../config.json", "previews/config.json", "config.json", "previews/step_1.png"):
-                with pytest.raises(urllib.error.HTTPError, match="404"):
-                    _read(url, path)
-        finally:
-            server.shutdown()
-            thread.join()
+    with serve(Training(ViewOptions(run)), "127.0.0.1", 0, "s3cret") as (server, url), answering(server):
+        assert b"training.js" in _read(url, "")
+        assert json.loads(_read(url, "training.json"))["previews"] == ["step_000005.png"]
+        assert _read(url, "previews/step_000005.png") == (run / "previews/step_000005.png").read_bytes()
+        for path in ("previews/../config.json", "previews/config.json", "config.json", "previews/step_1.png"):
+            with pytest.raises(urllib.error.HTTPError, match="404"):
+                _read(url, path)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_it_grows_in_a_browser_and_the_avatar_opens_once_it_is_there(run, tmp_path):
     training = Training(ViewOptions(run, size=(64, None), raster="cpu"))
-    with serve(training, "127.0.0.1", 0, "s3cret") as (server, url), chromium(tmp_path / "profile") as page:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            page.open(url)
-            page.wait("document.getElementById('facts')?.textContent.includes('10 of 100')")
-            page.wait("document.getElementById('preview').naturalWidth === 4")
-            assert page.run("document.querySelectorAll('#curves path').length") == 1
-            assert not AXE.is_file() or violations(page) == []
-            with (run / "metrics.jsonl").open("a") as stream:
-                stream.write(_rows(10, 11))
-            _status(run, step=12)
-            page.wait("document.getElementById('facts').textContent.includes('12 of 100')")
-            (run / "avatar.onnx").symlink_to(ASSETS / "avatar.onnx")
-            page.wait("!document.getElementById('avatar').hidden")
-            page.run("document.getElementById('avatar').click()")
-            page.wait("window.rnd && rnd.scene()")
-            assert page.messages == []
-        finally:
-            server.shutdown()
-            thread.join()
-            training.close()
+    with (
+        serve(training, "127.0.0.1", 0, "s3cret") as (server, url),
+        answering(server),
+        chromium(tmp_path / "profile") as page,
+    ):
+        page.open(url)
+        page.wait("document.getElementById('facts')?.textContent.includes('10 of 100')")
+        page.wait("document.getElementById('preview').naturalWidth === 4")
+        assert page.run("document.querySelectorAll('#curves path').length") == 1
+        assert not AXE.is_file() or violations(page) == []
+        with (run / "metrics.jsonl").open("a") as stream:
+            stream.write(_rows(10, 11))
+        _status(run, step=12)
+        page.wait("document.getElementById('facts').textContent.includes('12 of 100')")
+        (run / "avatar.onnx").symlink_to(ASSETS / "avatar.onnx")
+        page.wait("!document.getElementById('avatar').hidden")
+        page.run("document.getElementById('avatar').click()")
+        page.wait("window.rnd && rnd.scene()")
+        assert page.messages == []
+    training.close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import urllib.error
 import urllib.request
 
@@ -18,7 +17,7 @@ from rnd_viewer.view.options import ViewOptions
 from rnd_viewer.view.scene import Scene
 from rnd_viewer.view.server import serve
 from rnd_viewer.view.state import ViewState
-from support.browser import CHROMIUM, Page, chromium
+from support.browser import CHROMIUM, Page, answering, chromium
 from support.paths import ASSETS
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
@@ -44,16 +43,15 @@ TARGETS = """[...document.querySelectorAll("button, select, input:not([type=file
 def opened(tmp_path_factory):
     """The page, which may choose its size, and its address."""
     scene = Scene(ViewOptions(ASSETS / "avatar.onnx", ASSETS / "walk.npz", (ASSETS / "sky.exr",), raster="cpu"))
-    with serve(scene, "127.0.0.1", 0, "s3cret") as (server, url):
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        with chromium(tmp_path_factory.mktemp("profile")) as browser:
-            browser.open(url)
-            browser.wait("window.rnd && rnd.scene()")
-            yield browser, url
-            assert browser.messages == []
-        server.shutdown()
-        thread.join()
+    with (
+        serve(scene, "127.0.0.1", 0, "s3cret") as (server, url),
+        answering(server),
+        chromium(tmp_path_factory.mktemp("profile")) as browser,
+    ):
+        browser.open(url)
+        browser.wait("window.rnd && rnd.scene()")
+        yield browser, url
+        assert browser.messages == []
     scene.close()
 
 

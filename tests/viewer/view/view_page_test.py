@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import re
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -24,7 +23,7 @@ from rnd_viewer.view.options import SIZES, ViewOptions
 from rnd_viewer.view.scene import Scene
 from rnd_viewer.view.server import serve
 from support.axe import needs_axe, violations
-from support.browser import CHROMIUM, Page, chromium
+from support.browser import CHROMIUM, Page, answering, chromium
 from support.paths import ASSETS
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
@@ -58,12 +57,8 @@ def scene(motion):
 
 @contextmanager
 def _serving(scene: Scene) -> Iterator[str]:
-    with serve(scene, "127.0.0.1", 0, "s3cret") as (server, url):
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
+    with serve(scene, "127.0.0.1", 0, "s3cret") as (server, url), answering(server):
         yield url
-        server.shutdown()
-        thread.join()
 
 
 @pytest.fixture(scope="module")
