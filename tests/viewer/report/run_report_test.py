@@ -182,7 +182,7 @@ def test_benchmarks_of_the_software_are_shown_where_they_are_named_alone(run, tm
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
-def test_the_whole_of_a_training_has_four_screens_of_a_desk(run, tmp_path):
+def test_the_whole_of_a_training_has_four_screens_of_a_desk_and_six_of_a_phone(run, tmp_path):
     """Of the README's capture: four splits of ten frames, thirteen terms of loss."""
     for split in range(4):
         for frame in range(10):
@@ -201,6 +201,12 @@ def test_the_whole_of_a_training_has_four_screens_of_a_desk(run, tmp_path):
         assert page.run("document.images.length") > 60
         assert 3 < page.run("document.documentElement.scrollHeight / 900") <= 4
         assert page.run("document.documentElement.scrollWidth") == 1440
+        page.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=2, mobile=True)
+        assert 3 < page.run("document.documentElement.scrollHeight / 844") <= 6
+        assert page.run("document.documentElement.scrollWidth") == 390
+        page.run("document.querySelector('.shots').focus()")  # what does not fit is reached by the keyboard
+        page.call("Input.dispatchKeyEvent", type="rawKeyDown", windowsVirtualKeyCode=39, key="ArrowRight")
+        page.wait("document.querySelector('.shots').scrollLeft > 0")
 
 
 def test_what_a_run_lacks_is_named(run):

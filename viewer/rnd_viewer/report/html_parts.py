@@ -69,6 +69,12 @@ def figure(content: str, caption: str) -> str:
     return f"<figure>{content}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
+def strip(figures: Sequence[str], label: str, kind: str) -> str:
+    """``figures`` side by side; on a narrow screen they scroll, by the keyboard too. ``kind``: a class of page.html."""
+    content = "".join(figures)
+    return f'<div class="strip {kind}" tabindex="0" role="group" aria-label="{escape(label)}">{content}</div>'
+
+
 def missing(reason: str) -> str:
     """What stands in a section whose content is missing."""
     return f'<p class="missing">{escape(reason)}</p>'

@@ -24,7 +24,7 @@ from rnd_viewer.play.video import INSTALL
 
 from .bench import TITLE as BENCH
 from .bench import bench_section
-from .html_parts import compare, cropped, curve, data_uri, figure, missing, png, sections, table
+from .html_parts import compare, cropped, curve, data_uri, figure, missing, png, sections, strip, table
 from .renders import AvatarRenders
 from .run_files import read_config, read_losses, read_scores
 
@@ -146,10 +146,9 @@ def _avatar(renders: AvatarRenders, hdrs: tuple[Path, ...], hdr_up: Up) -> dict[
         turntable = figure(video, "turntable, learned light")
     else:
         turntable = missing(f"The turntable needs PyAV: {INSTALL}")
-    html = (
-        f'<div class="row">{turntable}{"".join(figures[: len(lit)])}</div>'
-        f'<h3>Materials</h3><div class="row">{"".join(figures[len(lit) :])}</div>'
-    )
+    lights = strip(figures[: len(lit)], "the avatar in other lights", "body")
+    surfaces = strip(figures[len(lit) :], "the avatar's materials", "body")
+    html = f'<div class="row">{turntable}{lights}</div><h3>Materials</h3>{surfaces}'
     notes = "".join(f"<p>Note: {escape(note)}</p>" for note in renders.notes)
     close_ups = [figure(png(image, f"{caption}: albedo"), caption) for caption, image in renders.close_ups()]
     small = f'<p>Albedo, at rest.</p><div class="grid small">{"".join(close_ups)}</div>' if close_ups else ""
@@ -175,10 +174,10 @@ def _comparisons(folder: Path, count: int) -> str:
     parts = [f"<p>{how}</p>"]
     seen = set()
     for split in splits:
-        strips = sorted(split.glob("*.png"))
-        shown = min(count, len(strips))
-        chosen = [strips[k * len(strips) // shown] for k in range(shown)]
-        hashes = tuple((strip.name, sha256_of(strip)) for strip in chosen)
+        paths = sorted(split.glob("*.png"))
+        shown = min(count, len(paths))
+        chosen = [paths[k * len(paths) // shown] for k in range(shown)]
+        hashes = tuple((path.name, sha256_of(path)) for path in chosen)
         if hashes in seen:
             continue
         seen.add(hashes)
@@ -186,20 +185,19 @@ def _comparisons(folder: Path, count: int) -> str:
         if split.name == SCALED:
             title = "relight, albedo scaled"
             note = "<p>The same frames, with the learned albedo brought to the scale of the true one.</p>"
-        figures = "".join(_strip(strip) for strip in chosen)
-        parts.append(f'<h3>{escape(title)}</h3>{note}<div class="grid shots">{figures}</div>')
+        parts.append(f"<h3>{escape(title)}</h3>{note}{strip([_tiles(path) for path in chosen], title, 'shots')}")
     return "".join(parts)
 
 
-def _strip(strip: Path) -> str:
+def _tiles(path: Path) -> str:
     """One strip of rnd-eval, cropped to the person: a slider between truth and render, then the other tiles."""
-    pixels = read_image(strip)[..., :3]
+    pixels = read_image(path)[..., :3]
     if pixels.dtype != np.uint8 or pixels.shape[1] % len(TILES):
-        raise InputError("strip of rnd-eval", expected="five 8-bit tiles", got=pixels.shape, file=strip)
+        raise InputError("strip of rnd-eval", expected="five 8-bit tiles", got=pixels.shape, file=path)
     tiles = cropped(np.split(pixels.astype(np.uint8), len(TILES), axis=1))
-    truth, render, *others = (png(tile, f"{what}, {strip.stem}") for what, tile in zip(TILES, tiles))
-    pair = compare(truth, render, f"truth or render of {strip.stem}")
-    return figure(f'<div class="shot">{pair}{"".join(others)}</div>', strip.stem)
+    truth, render, *others = (png(tile, f"{what}, {path.stem}") for what, tile in zip(TILES, tiles))
+    pair = compare(truth, render, f"truth or render of {path.stem}")
+    return figure(f'<div class="shot">{pair}{"".join(others)}</div>', path.stem)
 
 
 def _curves(rows: Sequence[dict[str, Any]]) -> str:
@@ -218,10 +216,7 @@ def _curves(rows: Sequence[dict[str, Any]]) -> str:
     skipped = sum(bool(row.get("skipped")) for row in rows)
     note = f" {skipped} steps were not finite and were skipped." if skipped else ""
     dashed = "" if mark is None else "; the dashed line marks the second stage, the light"
-    return (
-        f"<p>Weighted loss terms on a logarithmic scale{dashed}.{note}</p>"
-        f'<div class="grid curves">{"".join(figures)}</div>'
-    )
+    return f"<p>Weighted loss terms on a logarithmic scale{dashed}.{note}</p>{strip(figures, 'losses', 'curves')}"
 
 
 def _configuration(config: dict[str, Any]) -> str:
