@@ -12,11 +12,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rnd_bench.lifter.pose2sim import Calibrated
-from rnd_bench.studies.film_truth import _placed, exact_poses, in_capture_of
+from rnd_bench.studies.film_truth import WHAM_PA_MM, _placed, exact_poses, in_capture_of, wham_like
+from rnd_bench.studies.video import LIMBS, pa_mm
 from rnd_runtime.capture.capture import Capture
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
-from support.tiny import write_capture
+from support.tiny import motion, write_capture
 
 TURN = Rotation.from_euler("xyz", [0.2, 1.1, -0.3]).as_matrix()
 
@@ -70,6 +71,20 @@ def test_a_video_that_misses_frames_has_no_exact_poses(truth, imported) -> None:
     short = replace(motion, rotations=motion.rotations[1:], translations=motion.translations[1:])
     with pytest.raises(InputError, match="the person in all"):
         exact_poses(truth, replace(imported, motion=short))
+
+
+def test_noise_is_as_large_and_as_smooth_as_whams_errors(truth) -> None:
+    capture = replace(truth, motion=motion(truth.body, 60))
+    noisy = wham_like(capture)
+    skeleton = capture.body.skeleton
+    index = [skeleton.names.index(name) for name in LIMBS]
+    joints, moved = (
+        skeleton.joint_transforms(one.rotations, one.translations)[:, index][..., :3, 3]
+        for one in (capture.motion, noisy.motion)
+    )
+    assert pa_mm(moved, joints) == pytest.approx(WHAM_PA_MM, rel=0.01)
+    acceleration = np.diff(moved - joints, 2, axis=0) * capture.motion.fps**2
+    assert 5 < np.linalg.norm(acceleration, axis=-1).mean() < 9  # m/s²
 
 
 def test_another_camera_stands_where_it_was_in_a_world_of_another_size() -> None:

@@ -1,4 +1,4 @@
-"""What a video's makers know and it does not show: exact poses, and other cameras of the same instants."""
+"""What a video does not show: exact poses, other cameras of the same instants, another estimator's errors."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from rnd_bench.lifter.pose2sim import SCORED, Calibrated, watched
 from rnd_runtime.capture.capture import Capture, Frame, load_capture, save_capture
@@ -18,15 +19,22 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
 from rnd_runtime.motion.motion import Motion
+from rnd_stage.film.estimates import estimated_motion
 from rnd_trainer.estimating.observations import Observations
 from rnd_trainer.importing.images import undistort_image
 from rnd_trainer.importing.videos.video_file import VideoFile
+
+from .video import LIMBS, pa_mm
 
 Floats = NDArray[np.float64]
 
 HIPS = ("left_hip", "right_hip")
 INSTANTS = 5
 """scored by each camera"""
+WHAM_PA_MM = 35.9
+"""WHAM's error on 3DPW. Source: Shin et al. 2023 (arXiv 2312.07531), table 1"""
+WHAM_SECONDS = 0.1
+"""makes its errors as smooth: accelerations of real videos are then 6.6 m/s² off, as in that table"""
 
 
 # -- a rendered person -------------------------------------------------------------------------------------
@@ -78,6 +86,25 @@ def _moved(truth: Capture, to_truth: Floats) -> Motion:
     return replace(
         motion, rotations=rotations, translations=(root + motion.translations) @ back[:3, :3].T + back[:3, 3] - root
     )
+
+
+# -- another estimator's errors ----------------------------------------------------------------------------
+
+
+def wham_like(capture: Capture) -> Capture:
+    """``capture`` in poses with noise as large and as smooth as WHAM's errors added."""
+    skeleton = capture.body.skeleton
+    chosen = [skeleton.names.index(name) for name in LIMBS]
+
+    def limbs(motion: Motion) -> Floats:
+        return skeleton.joint_transforms(motion.rotations, motion.translations)[:, chosen][..., :3, 3]
+
+    def noisy(strength: float) -> Motion:
+        return estimated_motion(capture.motion, 0, strength, jitter=0, seconds=WHAM_SECONDS)
+
+    given = limbs(capture.motion)
+    strength = brentq(lambda strength: pa_mm(limbs(noisy(strength)), given) - WHAM_PA_MM, 0, 10, rtol=1e-3)
+    return replace(capture, motion=noisy(strength))
 
 
 # -- real cameras ------------------------------------------------------------------------------------------

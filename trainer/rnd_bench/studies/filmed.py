@@ -27,7 +27,7 @@ from rnd_trainer.importing.options import ImportOptions
 from rnd_trainer.losses.perceptual import Perceptual, load_lpips
 from rnd_trainer.model.checkpoint import load_checkpoint
 
-from .film_truth import exact_poses, in_capture_of, other_cameras
+from .film_truth import exact_poses, in_capture_of, other_cameras, wham_like
 from .trainings import train
 from .variants import VARIANTS, StudyRow, chosen
 from .video_options import Filmed
@@ -40,6 +40,7 @@ METHODS = (
     next(row for row in VARIANTS if row.name == "LBS, plain colour"),
 )
 EXACT = StudyRow("exact poses", "the true poses instead of estimated ones", "ours")
+WHAM = StudyRow("WHAM-like noise", "added to the estimated poses, none refined", "ours")
 ROWS = "rows.json"  # in the folder of a run
 
 
@@ -74,7 +75,7 @@ def run(options: Filmed) -> None:
     rows: list[dict[str, Any]] = []
     with Progress() as progress:
         for film in _films(options, out, progress):
-            methods = [*METHODS, *([EXACT] if film.exact else [])]
+            methods = [*METHODS, EXACT if film.exact else WHAM]
             for method in chosen(methods, options.methods):
                 progress.phase(f"{film.name}: {method.name}", 1)
                 rows += _rows(film, method, config, out, (perceptual, judge), progress.update)
@@ -134,6 +135,7 @@ def _rows(
         return found
     config = replace(base, model=dataclasses.replace(base.model, **method.model), **method.train)
     capture = film.exact if method is EXACT and film.exact is not None else film.capture
+    capture = wham_like(capture) if method is WHAM else capture
     training = train(capture, config, folder, networks[0], on_share=on_share)
     checkpoint = load_checkpoint(folder / "avatar.ckpt")
     poses = {"exact": film.scored}

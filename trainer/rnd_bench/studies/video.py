@@ -136,8 +136,13 @@ def _errors(found: Floats, truth: Floats, root: Floats, true_root: Floats) -> di
     return {
         "absolute_mm": 1e3 * float(np.linalg.norm(found - truth, axis=-1).mean()),
         "root_relative_mm": 1e3 * float(np.linalg.norm(relative, axis=-1).mean()),
-        "pa_mm": 1e3 * float(np.mean([_aligned(a, b).mean() for a, b in zip(found, truth)])),
+        "pa_mm": pa_mm(found, truth),
     }
+
+
+def pa_mm(found: Floats, truth: Floats) -> float:
+    """Mean distance, mm, of points [T, N, 3] after a similarity a frame."""
+    return 1e3 * float(np.mean([_aligned(a, b).mean() for a, b in zip(found, truth)]))
 
 
 def _aligned(found: Floats, truth: Floats) -> Floats:

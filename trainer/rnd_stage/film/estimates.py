@@ -26,13 +26,18 @@ MASK_WANDER = 2.5  # pixels of an image of 512: amplitude of the edge's displace
 MASK_GRAIN = 9.0  # pixels of an image of 512: its correlation length
 
 
-def estimated_motion(motion: Motion, seed: int, strength: float = 1.0) -> Motion:
-    """``motion`` with jitter and drift of every joint and of the root's position; strength 0 changes nothing."""
+def estimated_motion(
+    motion: Motion, seed: int, strength: float = 1.0, *, jitter: float = 1.0, seconds: float = DRIFT_SECONDS
+) -> Motion:
+    """``motion`` with jitter and drift, smooth over ``seconds``, of every joint and of the root's position.
+
+    ``jitter`` is a factor on the jitter alone; strength 0 changes nothing.
+    """
     rng = np.random.default_rng((seed, 1))
     shape = (motion.frame_count, len(motion.joint_names), 3)
-    sigma = DRIFT_SECONDS * motion.fps
-    angles = POSE_JITTER * rng.normal(size=shape) + POSE_DRIFT * _wandering(rng, shape, sigma)
-    shifts = ROOT_JITTER * rng.normal(size=(shape[0], 3)) + ROOT_DRIFT * _wandering(rng, (shape[0], 3), sigma)
+    sigma = seconds * motion.fps
+    angles = jitter * POSE_JITTER * rng.normal(size=shape) + POSE_DRIFT * _wandering(rng, shape, sigma)
+    shifts = jitter * ROOT_JITTER * rng.normal(size=(shape[0], 3)) + ROOT_DRIFT * _wandering(rng, (shape[0], 3), sigma)
     return replace(
         motion,
         rotations=motion.rotations @ axis_angle_to_matrix(strength * angles),
