@@ -37,7 +37,6 @@ from rnd_runtime.core.images import linear_to_srgb, to_bytes
 from rnd_runtime.raster.oracle import NEAR
 from rnd_runtime.shading.sh import COSINE_LOBE, sh_basis
 from rnd_runtime.shading.shader import Shader
-from rnd_runtime.shading.shadow import NO_CASTERS, Casters
 
 from . import cryptomatte
 
@@ -72,17 +71,20 @@ def parse_aovs(text: str) -> tuple[str, ...]:
 
 
 class Lit(NamedTuple):
-    """How Gaussians were shaded: by ``shader``, towards a camera at ``eye`` [3] m, to ``radiance`` [N, 3]."""
+    """How Gaussians were shaded: by ``shader``, towards a camera at ``eye`` [3] m, to ``radiance`` [N, 3].
+
+    ``sunlit`` as of ``Shader.shade``.
+    """
 
     shader: Shader
     eye: NDArray[np.float64]
     seen: NDArray[np.bool_] | None
     radiance: Floats32
-    casters: Casters = NO_CASTERS
+    sunlit: Floats32
 
-    def again(self, gaussians: Gaussians, *, shadows: bool = True) -> Floats32:
-        """Radiance [N, 3] of other ``gaussians``."""
-        return self.shader.shade(gaussians, self.eye, self.seen, shadows=shadows, casters=self.casters)
+    def again(self, gaussians: Gaussians, sunlit: Floats32 | None = None) -> Floats32:
+        """Radiance [N, 3] of other ``gaussians``, or of others that are ``sunlit``."""
+        return self.shader.shade(gaussians, self.eye, self.seen, sunlit=self.sunlit if sunlit is None else sunlit)
 
 
 def splat_features(
@@ -104,7 +106,7 @@ def splat_features(
         "visibility": lambda: ambient_visibility(gaussians)[:, None],
         "diffuse": lambda: lit.radiance - specular,
         "specular": lambda: specular,
-        "shadow": lambda: lit.again(gaussians, shadows=False) - lit.radiance,
+        "shadow": lambda: lit.again(gaussians, np.ones_like(lit.sunlit)) - lit.radiance,
     }
     return [given[name] if name in GIVEN else features[name]() for name in names if name != "depth"]
 

@@ -32,7 +32,6 @@ from rnd_runtime.raster.outline import sharpened
 from rnd_runtime.raster.tone import tone_map, tone_map_straight
 from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.shader import Shader, shadow_radii
-from rnd_runtime.shading.shadow import NO_CASTERS, Casters
 
 from .aov import Lit, aov_layers, splat_features
 from .far import fine_view
@@ -359,15 +358,16 @@ def features_of(
     aovs: Sequence[str],
     lit: bool,
     given: Mapping[str, Floats32],
-    casters: Casters = NO_CASTERS,
+    sunlit: Floats32 | None = None,
 ) -> Floats32:
-    """Features [N, C] to splat: radiance if ``lit``, then those of the AOVs. ``casters`` cast shadows too."""
-    shade = lit or {"diffuse", "shadow"} & {*aovs}
-    radiance = np.zeros_like(gaussians.albedo)
-    if shade:
-        radiance = shader.shade(gaussians, camera.position, visible, casters=casters)
+    """Features [N, C] to splat: radiance if ``lit``, then those of the AOVs. ``sunlit``: as of ``Shader.shade``."""
+    if lit or {"diffuse", "specular", "shadow"} & {*aovs}:
+        sunlit = shader.sunlit(gaussians, visible) if sunlit is None else sunlit
+        radiance = shader.shade(gaussians, camera.position, visible, sunlit=sunlit)
+    else:
+        radiance = sunlit = np.empty((len(visible), 0), np.float32)
     features = [radiance] if lit else []
-    features += splat_features(aovs, gaussians, camera, Lit(shader, camera.position, visible, radiance, casters), given)
+    features += splat_features(aovs, gaussians, camera, Lit(shader, camera.position, visible, radiance, sunlit), given)
     return features[0] if len(features) == 1 else np.concatenate(features, axis=1)
 
 

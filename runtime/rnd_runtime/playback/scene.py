@@ -27,8 +27,8 @@ from rnd_runtime.motion.motion import Motion
 from rnd_runtime.raster.in_view import visible_to
 from rnd_runtime.raster.oracle import NEAR
 from rnd_runtime.raster.tone import tone_map
-from rnd_runtime.shading.shader import Shader, shadow_radii
-from rnd_runtime.shading.shadow import NO_CASTERS, Casters
+from rnd_runtime.shading.shader import SHADOW_RESOLUTION, Shader, shadow_radii
+from rnd_runtime.shading.shadow import axes_towards, directional_visibility
 
 from .aov import aov_layers
 from .far import MARGIN, depth_groups, extent
@@ -41,6 +41,8 @@ LEVEL_SPACING = 0.24
 as root mean square over the body's box (``rnd-bench scenes``)"""
 HYSTERESIS = 1.15
 """factor on the distance between taking a coarser level and giving it back"""
+MAX_SHADOW_RESOLUTION = 4096
+"""texels along a depth map of several bodies: 20 m as fine as for one"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,16 +209,51 @@ class SceneRenderer:
         given: Sequence[Mapping[str, Floats32]],
     ) -> tuple[list[NDArray[np.bool_]], list[Floats32]]:
         """Who is visible [N] and features [N, C], for each body."""
-        shadows = _Shadows.of(posed, joints, shader)
-        visible, features = [], []
-        for number, (gaussians, cull) in enumerate(zip(posed, self._culls)):
-            seen = visible_to(gaussians, camera, None if cull is None or cull <= -1 else cull)
-            casters = shadows.casters_on(number) if seen.any() else NO_CASTERS
-            visible.append(seen)
-            features.append(
-                features_of(gaussians, shader, camera, seen, aovs=aovs, lit=True, given=given[number], casters=casters)
-            )
+        visible = [
+            visible_to(gaussians, camera, None if cull is None or cull <= -1 else cull)
+            for gaussians, cull in zip(posed, self._culls)
+        ]
+        sunlit = self._sunlit(posed, joints, shader, visible)
+        features = [
+            features_of(gaussians, shader, camera, seen, aovs=aovs, lit=True, given=own, sunlit=reached)
+            for gaussians, seen, own, reached in zip(posed, visible, given, sunlit)
+        ]
         return visible, features
+
+    def _sunlit(
+        self,
+        posed: Sequence[Gaussians],
+        joints: Sequence[NDArray[np.float64]],
+        shader: Shader,
+        receivers: Sequence[NDArray[np.bool_]],
+    ) -> list[Floats32]:
+        """``Shader.sunlit`` of each body past all of them; those whose shadows may meet share a map."""
+        directions = shader.directional_arrays().directions
+        sunlit = [np.zeros((len(gaussians.means), len(directions)), np.float32) for gaussians in posed]
+        low, high = (np.array([side(points, axis=0) for points in joints]) for side in (np.min, np.max))
+        centres, sizes = (low + high) / 2, np.linalg.norm(high - low, axis=1)
+        reach = sizes / 2 + MARGIN
+        for light, direction in enumerate(directions):
+            across = centres @ axes_towards(direction)[:2].T
+            apart = np.linalg.norm(across[:, None] - across, axis=-1)
+            for bodies in _connected(apart < reach[:, None] + reach):
+                points, normals, radii, seen = (
+                    self._together(name, parts)
+                    for name, parts in (
+                        ("means", [posed[i].means for i in bodies]),
+                        ("normals", [posed[i].normals for i in bodies]),
+                        ("radii", [shadow_radii(posed[i]) for i in bodies]),
+                        ("visible", [receivers[i] for i in bodies]),
+                    )
+                )
+                wider = 1 + np.ptp(across[bodies], axis=0).max() / sizes[bodies].max()
+                resolution = min(round(SHADOW_RESOLUTION * wider), MAX_SHADOW_RESOLUTION)
+                reached = directional_visibility(
+                    points, normals, direction[None], radii=radii, resolution=resolution, receivers=seen
+                )
+                for body, rows in zip(bodies, np.split(reached, np.cumsum([len(sunlit[i]) for i in bodies[:-1]]))):
+                    sunlit[body][:, light] = rows[:, 0]
+        return sunlit
 
     def _splatted(
         self,
@@ -301,47 +338,12 @@ class SceneRenderer:
         return np.concatenate(parts, out=kept[:rows])
 
 
-@dataclass(frozen=True, eq=False)
-class _Shadows:
-    """Bodies as casters of the shadows of directional lights.
-
-    Attributes:
-        points, normals, radii: of all Gaussians, body after body.
-        rows: those that cast, for each body.
-        centres: [B, 3] m, and radii ``reach`` [B] m, of spheres around the bodies.
-        towards: [K, 3] unit, towards the lights.
-    """
-
-    points: Floats32
-    normals: Floats32
-    radii: Floats32
-    rows: Sequence[NDArray[np.int64]]
-    centres: Floats
-    reach: Floats
-    towards: Floats
-
-    @classmethod
-    def of(cls, posed: Sequence[Gaussians], joints: Sequence[NDArray[np.float64]], shader: Shader) -> _Shadows:
-        towards = shader.directional_arrays().directions.astype(np.float64)
-        low, high = (np.array([side(points, axis=0) for points in joints]) for side in (np.min, np.max))
-        spheres = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2 + MARGIN
-        if not len(towards):
-            none = NO_CASTERS
-            return cls(none.points, none.normals, none.radii, [none.rows] * len(posed), *spheres, towards)
-        radii = [shadow_radii(gaussians) for gaussians in posed]
-        starts = np.cumsum([0, *map(len, radii)])
-        rows = [first + np.flatnonzero(of > 0) for first, of in zip(starts, radii)]
-        points, normals = (
-            np.concatenate([getattr(gaussians, name) for gaussians in posed]) for name in ("means", "normals")
-        )
-        return cls(points, normals, np.concatenate(radii), rows, *spheres, towards)
-
-    def casters_on(self, receiver: int) -> Casters:
-        """Those of other bodies that may stand between the body ``receiver`` and a light."""
-        offsets, apart = self.centres - self.centres[receiver], self.reach + self.reach[receiver]
-        along = offsets @ self.towards.T  # [B, K]
-        across = np.sqrt(np.maximum((offsets**2).sum(1)[:, None] - along**2, 0))
-        casting = ((across < apart[:, None]) & (along > -apart[:, None])).any(axis=1)
-        casting[receiver] = False
-        rows = [self.rows[i] for i in np.flatnonzero(casting).tolist()]
-        return Casters(self.points, self.normals, self.radii, np.concatenate(rows)) if rows else NO_CASTERS
+def _connected(near: NDArray[np.bool_]) -> list[list[int]]:
+    """Groups of the numbers of rows that a symmetric relation [B, B] connects."""
+    groups: dict[int, list[int]] = {}
+    labels = np.arange(len(near))
+    while (least := np.where(near, labels, len(near)).min(axis=1)).tolist() != labels.tolist():
+        labels = least
+    for row, label in enumerate(labels.tolist()):
+        groups.setdefault(label, []).append(row)
+    return list(groups.values())

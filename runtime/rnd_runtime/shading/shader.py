@@ -27,7 +27,7 @@ from .ambient import AmbientLight
 from .direct import DirectionalArrays, add_directional
 from .directional import DirectionalLight, extract_directional
 from .light import Light
-from .shadow import NO_CASTERS, Casters, directional_visibility
+from .shadow import directional_visibility
 from .sum import DistantLights
 from .tables import SkyTables
 
@@ -98,34 +98,39 @@ class Shader:
         camera_position: ArrayLike,
         visible: ArrayLike | None = None,
         *,
-        shadows: bool = True,
-        casters: Casters = NO_CASTERS,
+        sunlit: Floats32 | None = None,
     ) -> Floats32:
         """Linear radiance [N, 3], not negative, of each Gaussian towards the camera at [3] m.
 
-        Gaussians that are not ``visible`` [N] keep radiance 0 and still cast shadows; all are visible by default.
-        Without ``shadows`` directional lights are unoccluded; ``casters`` occlude them too.
+        Gaussians that are not ``visible`` [N] keep radiance 0; all are visible by default. ``sunlit`` is as returned by
+        the method of that name, which gives it by default.
         """
         light_to_world = self.light_to_world
         visible = mask(visible, len(gaussians.means))
         radiance = self.sky.shade(gaussians, camera_position, light_to_world, visible)
         if self.directional and len(radiance):
-            lights = self.directional_arrays()
-            visibility = np.ones((len(radiance), len(lights.directions)), np.float32)
-            if shadows:
-                visibility = directional_visibility(
-                    gaussians.means,
-                    gaussians.normals,
-                    lights.directions,
-                    radii=shadow_radii(gaussians),
-                    resolution=SHADOW_RESOLUTION,
-                    receivers=visible,
-                    casters=casters,
-                )
+            sunlit = self.sunlit(gaussians, visible) if sunlit is None else floats(sunlit)
             surfaces = (gaussians.means, gaussians.normals, gaussians.albedo, gaussians.roughness, gaussians.visibility)
             eye = np.array(camera_position, np.float32)
-            add_directional(tuple(floats(a) for a in surfaces), floats(visibility), eye, lights, visible, radiance)
+            lights = self.directional_arrays()
+            add_directional(tuple(floats(a) for a in surfaces), sunlit, eye, lights, visible, radiance)
         return radiance
+
+    def sunlit(self, gaussians: Gaussians, receivers: ArrayLike | None = None) -> Floats32:
+        """Share [N, S] of each directional light that reaches the Gaussians' surfaces past all of them.
+
+        0 where not among ``receivers`` [N].
+        """
+        if not self.directional:
+            return np.empty((len(gaussians.means), 0), np.float32)
+        return directional_visibility(
+            gaussians.means,
+            gaussians.normals,
+            self.directional_arrays().directions,
+            radii=shadow_radii(gaussians),
+            resolution=SHADOW_RESOLUTION,
+            receivers=receivers,
+        )
 
     def directional_arrays(self) -> DirectionalArrays:
         """Directional lights as kernel arrays, in the frame of the Gaussians."""

@@ -10,8 +10,6 @@ the number of threads, to the bit.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,20 +40,6 @@ _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
 BLOCK_SHIFT = 2
 BLOCK = 1 << BLOCK_SHIFT  # texels; a block is one value of sixteen lanes
 _CHUNK = 1024  # points per unit of parallel work
-_ABOVE = np.float32(0.1)  # m over the points of a map to which casters between them and the light are lowered
-
-
-class Casters(NamedTuple):
-    """Rows of points that cast shadows on other points, in the frame of these; radii as of those."""
-
-    points: Floats32  # [N, 3] m
-    normals: Floats32  # [N, 3] unit
-    radii: Floats32  # [N] m
-    rows: NDArray[np.int64]  # [N']
-
-
-_NOBODY = np.empty((0, 3), np.float32)
-NO_CASTERS = Casters(_NOBODY, _NOBODY, np.empty(0, np.float32), np.empty(0, np.int64))
 
 
 def directional_visibility(
@@ -66,7 +50,6 @@ def directional_visibility(
     radii: ArrayLike,
     resolution: int = 256,
     receivers: ArrayLike | None = None,
-    casters: Casters = NO_CASTERS,
 ) -> Floats32:
     """Share [N, K] in [0, 1] of a distant light in each direction that reaches each point.
 
@@ -80,7 +63,6 @@ def directional_visibility(
             random points (1.0 leaves 4 % of the surface open). A point of radius 0 casts no shadow and receives them.
         resolution: texels along the longer side of a depth map, which is cropped to the points' bounds.
         receivers: [N] points whose visibility is wanted; all by default. All points cast shadows.
-        casters: further points that cast shadows. The map's bounds are those of ``points``.
     """
     points, normals, directions = floats(points), floats(normals), floats(directions)
     if not (points.ndim == 2 and points.shape[1] == 3 and normals.shape == points.shape):
@@ -92,21 +74,21 @@ def directional_visibility(
     if not 8 <= resolution <= 8192:
         raise InputError("resolution of a depth map", expected="8 to 8192 texels", got=resolution)
     arrays = points, normals, np.full(len(points), radii, np.float32), mask(receivers, len(points))
-    visibility: Floats32 = cast_shadows(arrays, casters, directions, resolution, numba.get_num_threads())
+    visibility: Floats32 = cast_shadows(arrays, directions, resolution, numba.get_num_threads())
     return visibility
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def cast_shadows(arrays, casters, directions, resolution, threads):  # type: ignore[no-untyped-def]
+def cast_shadows(arrays, directions, resolution, threads):  # type: ignore[no-untyped-def]
     """``directional_visibility`` [N, K] of points, normals, radii and receivers."""
     visibility = np.zeros((len(directions), len(arrays[0])), np.float32)
     for k in range(len(directions)):
-        _one_direction(arrays, casters, axes_towards(directions[k]), resolution, threads, visibility[k])
+        _one_direction(arrays, axes_towards(directions[k]), resolution, threads, visibility[k])
     return np.ascontiguousarray(visibility.T)
 
 
 @numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _one_direction(arrays, casters, frame, resolution, threads, visibility):  # type: ignore[no-untyped-def]
+def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ignore[no-untyped-def]
     points, _, radii, receivers = arrays
     count = len(points)
     chunks = (count + _CHUNK - 1) // _CHUNK
@@ -140,9 +122,6 @@ def _one_direction(arrays, casters, frame, resolution, threads, visibility):  # 
         for i in range(count):
             if normal[i, 2] > 0 and radii[i] > 0:
                 _draw_disc(depth, across, position, normal, i, radii[i], texel, edges[band], edges[band + 1])
-    if len(casters.rows) > 0:
-        origin = left, bottom, texel, np.float32(width), np.float32(height)
-        _draw_casters(depth, across, casters, frame, origin, _reach(position, normal), edges)
     for i in numba.prange(count):
         if normal[i, 2] > 0 and receivers[i]:
             visibility[i] = _pcf_visibility(depth, across, position, normal, i, radii[i], texel)
@@ -166,46 +145,6 @@ def _to_map(arrays, frame, first, last, position, normal, bounds):  # type: igno
         left, right = min(left, position[i, 0]), max(right, position[i, 0])
         bottom, top = min(bottom, position[i, 1]), max(top, position[i, 1])
     bounds[0], bounds[1], bounds[2], bounds[3] = left, bottom, right, top
-
-
-@numba.njit(error_model="numpy")
-def _reach(position, normal):  # type: ignore[no-untyped-def]
-    """Least and greatest z of the points that face the light."""
-    low, high = _FAR, _EMPTY
-    for i in range(len(position)):
-        if normal[i, 2] > 0:
-            low, high = min(low, position[i, 2]), max(high, position[i, 2])
-    return low, high
-
-
-@numba.njit(parallel=True, error_model="numpy")
-def _draw_casters(depth, across, casters, frame, origin, reach, edges):  # type: ignore[no-untyped-def]
-    """Draw discs of other points that cover a part of the map and lie above its lowest point.
-
-    Those far above are lowered, which changes no shadow: the fall-off at a disc's rim must pass all points of the map.
-    """
-    left, bottom, texel, width, height = origin
-    low, high = reach
-    count = len(casters.rows)
-    position, normal = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
-    radii = np.empty(count, np.float32)
-    for k in numba.prange(count):
-        i = casters.rows[k]
-        p, n, radii[k] = casters.points[i], casters.normals[i], casters.radii[i]
-        for axis in range(3):
-            fx, fy, fz = frame[axis, 0], frame[axis, 1], frame[axis, 2]
-            position[k, axis] = fx * p[0] + fy * p[1] + fz * p[2]
-            normal[k, axis] = fx * n[0] + fy * n[1] + fz * n[2]
-        x, y = (position[k, 0] - left) / texel + 1, (position[k, 1] - bottom) / texel + 1
-        rim = radii[k] / texel + RIM_TEXELS
-        inside = (x + rim >= 0) & (x - rim <= width) & (y + rim >= 0) & (y - rim <= height)
-        if not (inside & (position[k, 2] + radii[k] > low) & (radii[k] > 0)):  # NaN too
-            normal[k, 2] = -1
-        position[k, 0], position[k, 1], position[k, 2] = x, y, min(position[k, 2], high + _ABOVE)
-    for band in numba.prange(len(edges) - 1):
-        for k in range(count):
-            if normal[k, 2] > 0:
-                _draw_disc(depth, across, position, normal, k, radii[k], texel, edges[band], edges[band + 1])
 
 
 @numba.njit(error_model="numpy")

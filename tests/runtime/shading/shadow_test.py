@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.shading.shadow import Casters, directional_visibility
+from rnd_runtime.shading.shadow import directional_visibility
 from support.shading_scenes import fibonacci_sphere
 
 SPACING = 0.015  # m between sampled points
@@ -155,45 +155,22 @@ def test_wrong_shapes_are_refused():
 SUN = np.array([0.3, 0.9, 0.0]) / np.hypot(0.3, 0.9)
 
 
-def _ball_and_screen(height):
-    """Points of a unit ball, their radius, and a square screen of side 0.8 m above it, towards ``SUN``."""
+@pytest.mark.parametrize("height", [1.3, 6.0])
+def test_another_body_shadows_what_a_ray_to_the_light_meets(height):
+    """A screen above a ball, against rays; in one map, as bodies of a scene share one."""
     ball = fibonacci_sphere(4 * 3000)
     x, z = (g.ravel() for g in np.meshgrid(*2 * [np.arange(-0.4, 0.4, SPACING)]))
     screen = np.stack([x + height * SUN[0] / SUN[1], np.full_like(x, height), z], -1).astype(np.float32)
-    normals = np.tile(np.float32([0, 1, 0]), (len(screen), 1))
-    rows = np.arange(len(screen))
-    return (
-        ball,
-        np.sqrt(4 * np.pi / len(ball)),
-        Casters(screen, normals, np.full(len(screen), SPACING, np.float32), rows),
-    )
-
-
-@pytest.mark.parametrize("height", [1.3, 40.0])
-def test_casters_shadow_what_a_ray_to_the_light_meets(height):
-    """At any distance: a screen above a ball, against rays."""
-    ball, radius, screen = _ball_and_screen(height)
-    alone, shaded = (
-        directional_visibility(ball, ball, [SUN], radii=radius, casters=casters)[:, 0]
-        for casters in (Casters(*screen[:3], screen.rows[:0]), screen)
-    )
-    hit = ball + ((height - ball[:, 1]) / SUN[1])[:, None] * SUN - screen.points.mean(axis=0)  # on the screen's plane
+    up = np.tile(np.float32([0, 1, 0]), (len(screen), 1))
+    points, normals = np.concatenate([ball, screen]), np.concatenate([ball, up])
+    radii = np.repeat(np.float32([np.sqrt(4 * np.pi / len(ball)), SPACING]), [len(ball), len(screen)])
+    alone = directional_visibility(ball, ball, [SUN], radii=radii[: len(ball)])[:, 0]
+    shaded = directional_visibility(points, normals, [SUN], radii=radii)[: len(ball), 0]
+    hit = ball + ((height - ball[:, 1]) / SUN[1])[:, None] * SUN - screen.mean(axis=0)  # on the screen's plane
     inside = np.abs(hit[:, [0, 2]]).max(axis=1)
     assert ((inside < 0.37) & (alone > 0)).sum() > 100
     assert (shaded[inside < 0.37] == 0).all()
     np.testing.assert_array_equal(shaded[inside > 0.43], alone[inside > 0.43])
-    if height > 2:  # aside, the screen meets no ray to the ball
-        far = screen._replace(points=screen.points + np.float32([30, 0, 0]))
-        np.testing.assert_array_equal(directional_visibility(ball, ball, [SUN], radii=radius, casters=far)[:, 0], alone)
-
-
-def test_casters_below_or_broken_shadow_nothing():
-    ball, radius, screen = _ball_and_screen(-1.2)
-    alone = directional_visibility(ball, ball, [[0, 1, 0]], radii=radius)
-    for casters in (screen, screen._replace(points=np.full_like(screen.points, np.nan))):
-        np.testing.assert_array_equal(
-            directional_visibility(ball, ball, [[0, 1, 0]], radii=radius, casters=casters), alone
-        )
 
 
 def test_others_than_receivers_cast_and_stay_dark():

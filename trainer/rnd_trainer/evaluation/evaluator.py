@@ -99,7 +99,8 @@ def _shade(
         return shader.shade(gaussians, camera.position)
     unoccluded = np.zeros_like(gaussians.visibility)
     unoccluded[:, 0] = SH_DC_OF_ONE
-    radiance = shader.shade(replace(gaussians, visibility=unoccluded), camera.position, shadows=False)
+    sunlit = np.ones((len(unoccluded), len(shader.directional)), np.float32)
+    radiance = shader.shade(replace(gaussians, visibility=unoccluded), camera.position, sunlit=sunlit)
     if kind == "paper":
         eye = torch.as_tensor(camera.position, dtype=torch.float32, device=posed.means.device)
         view = torch.nn.functional.normalize(eye - posed.means, dim=-1)
