@@ -18,7 +18,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton, taken_along
-from rnd_runtime.posing.levels import Surface, coarser
+from rnd_runtime.posing.levels import NODES_SHARE, Surface, coarser, on_fewer_nodes
 from rnd_runtime.posing.rest import RestPose, Unposed
 from rnd_runtime.posing.window import moment
 from rnd_runtime.shading.brdf import LARGEST_ALBEDO
@@ -31,12 +31,13 @@ MIN_GAUSSIANS = 2000
 
 
 class Encoded(NamedTuple):
-    """The networks' outputs for one pose, for ``Avatar.posed``.
+    """The networks' outputs for one pose, for ``posed`` of the ``avatar``, at its level of detail, that encoded it.
 
     Posing happens in the root's frame, and camera and light are taken there: float32 resolves the body whatever its
     position in the world.
     """
 
+    avatar: Avatar
     values: list[NDArray[np.float32]]  # node outputs: logits, unless skinning is static, offsets and visibility
     bones: NDArray[np.float32]  # [J, 3, 4] m, rest pose → this frame
     root: NDArray[np.float64]  # [4, 4] m, this frame → world
@@ -58,7 +59,8 @@ class Avatar:
 
     Attributes:
         skeleton: its joint tree. window_poses, window_seconds: the motion window. gaussians: N.
-        spacing: mean distance between Gaussians, m. trained_light: [32, 64, 3] linear radiance.
+        nodes: at which the networks are evaluated. spacing, node_spacing: mean distances between Gaussians and between
+            nodes, m. trained_light: [32, 64, 3] linear radiance.
         posed_outside: False for a graph that poses, which it does in the root's frame alone.
         metadata: all of the file's metadata. advice: how it may be played.
     """
@@ -70,6 +72,7 @@ class Avatar:
         self.skeleton = Skeleton(tuple(tree.names), np.array(tree.parents), np.array(tree.rest_joints, np.float64))
         self.window_poses, self.window_seconds = metadata.window_poses, metadata.window_seconds
         self.gaussians, self.spacing = metadata.gaussians, metadata.spacing_m
+        self.nodes = networks.nodes if networks.posed_outside else 0
         self._opacities, albedo, self._roughness = networks.materials
         self._albedo = np.minimum(albedo, np.float32(LARGEST_ALBEDO))
         self.posed_outside = networks.posed_outside
@@ -94,8 +97,17 @@ class Avatar:
 
     @cached_property
     def levels(self) -> tuple[Avatar, ...]:
-        """This avatar and coarser ones, for fewer and fewer pixels; made on first use, in a second."""
+        """This avatar and coarser ones, for fewer and fewer pixels; made on first use, in a second.
+
+        The second has all Gaussians and a share of the nodes, where the file allows that; others have no more nodes.
+        """
         levels = [self]
+        if self._rest is not None and self._networks.alike:
+            kept = np.arange(0, self.nodes, NODES_SHARE)
+            fewer_nodes = shallow_copy(self, nodes=len(kept))
+            fewer_nodes._networks = self._networks.at_nodes(kept.tolist())
+            fewer_nodes._rest = on_fewer_nodes(self._rest, kept)
+            levels.append(fewer_nodes)
         while self._rest is not None and (count := levels[-1].gaussians) > MIN_GAUSSIANS:
             finer = levels[-1]
             assert finer._rest is not None
@@ -105,10 +117,14 @@ class Avatar:
             fewer = len(opacities)
             if fewer == count:
                 break
-            level = shallow_copy(self, gaussians=fewer, spacing=self.spacing * math.sqrt(self.gaussians / fewer))
+            level = shallow_copy(finer, gaussians=fewer, spacing=self.spacing * math.sqrt(self.gaussians / fewer))
             level._rest, level._opacities, level._albedo, level._roughness = rest, opacities, albedo, roughness
             levels.append(level)
         return tuple(levels)
+
+    @property
+    def node_spacing(self) -> float:
+        return self.spacing * math.sqrt(self.gaussians / self.nodes)
 
     def scale_albedo(self, gain: Sequence[float]) -> None:
         """Multiply the albedo by ``gain`` [3] of linear R, G and B; it stays below what conserves energy.
@@ -130,7 +146,7 @@ class Avatar:
         )
         known = perf_counter()
         values = self._networks.at((window, velocity, bones))
-        return Encoded(values, bones, root, {"motion": known - started, "encoders": perf_counter() - known})
+        return Encoded(self, values, bones, root, {"motion": known - started, "encoders": perf_counter() - known})
 
     def posed(self, encoded: Encoded) -> Gaussians:
         """The second half of ``pose``, in the frame of ``encoded``."""

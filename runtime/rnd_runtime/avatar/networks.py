@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.avatar.inference import open_session, run_session
+from rnd_runtime.core.arrays import shallow_copy
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.kinds import explained
@@ -28,7 +29,7 @@ from .file import (
     read_advice,
     read_metadata,
 )
-from .onnx_parts import OnnxFile
+from .onnx_parts import OnnxFile, Rows
 from .operators import check_operators
 
 Floats32 = NDArray[np.float32]
@@ -51,6 +52,7 @@ class Networks:
         self.trained_light = decode_light(self.metadata)
         self._file, self._threads, self._path = file, threads or cores(), path
         self._sessions: dict[tuple[str, ...], Any] = {}
+        self._rows: Rows | None = None
         self.posed_outside = not {*NODE_OUTPUTS, *REST_OUTPUTS} - file.outputs.keys()
         self._aside = ThreadPoolExecutor(1, "networks")
         sessions = self._aside.submit(lambda: [self._session(part) for part in self._parts])
@@ -74,7 +76,17 @@ class Networks:
     @property
     def nodes(self) -> int:
         """How many nodes the networks are evaluated at, where the graph is ``posed_outside``."""
-        return self._file.outputs[NODE_OUTPUTS[0]][0]
+        return self._file.outputs[NODE_OUTPUTS[0]][0] if self._rows is None else len(self._rows.kept)
+
+    def at_nodes(self, kept: Sequence[int]) -> Networks:
+        """The same networks at some of the nodes, on one thread. ``posed_outside`` and ``alike`` alone."""
+        parts = (tuple(output for part in self._parts for output in part),)
+        return shallow_copy(self, _rows=Rows(self.nodes, kept), _sessions={}, _parts=parts, _threads=1)
+
+    @property
+    def alike(self) -> bool:
+        """Whether all nodes are treated alike: none has the template's skinning, unless all have."""
+        return self.metadata.variant.dynamic_nodes in (0, self.nodes) and self.nodes != self.metadata.gaussians
 
     def at(self, inputs: tuple[ArrayLike, ArrayLike, ArrayLike]) -> list[Floats32]:
         """What ``run`` gives for the nodes, Δ logits first unless skinning is static; or the posed outputs."""
@@ -104,6 +116,8 @@ class Networks:
         """The kernels that go over ``values`` check no bounds."""
         for name, value in zip(outputs, values):
             promised = self._file.outputs[name]
+            if self._rows is not None:
+                promised = [len(self._rows.kept), *promised[1:]]
             if promised and list(value.shape) != promised:  # integers' shapes are not read
                 raise InputError(name, expected=f"shape {promised}", got=list(value.shape))
 
@@ -119,7 +133,7 @@ class Networks:
         if outputs not in self._sessions:
             at_once = len(self._parts) if outputs in self._parts else 1
             threads = -(-self._threads // at_once)
-            self._sessions[outputs] = open_session(self._file.extract(outputs), threads)
+            self._sessions[outputs] = open_session(self._file.extract(outputs, self._rows), threads)
         return self._sessions[outputs]
 
     @cached_property

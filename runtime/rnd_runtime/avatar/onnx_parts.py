@@ -47,6 +47,16 @@ class Constant(NamedTuple):
     integers: tuple[int, ...] | None
 
 
+class Rows(NamedTuple):
+    """Of ``total`` things that a graph treats alike, the ``kept`` ones, ascending.
+
+    Constants of so many rows are theirs, and that number among the sizes of a shape is theirs too.
+    """
+
+    total: int
+    kept: Sequence[int]
+
+
 class OnnxFile:
     """The parts of an ONNX model.
 
@@ -122,10 +132,11 @@ class OnnxFile:
         produced = {name for node in self._nodes for name in node.outputs}
         return [n for n in names if not (n in produced or n in self._constants or n in self._input_data)]
 
-    def extract(self, outputs: Sequence[str]) -> bytes:
+    def extract(self, outputs: Sequence[str], rows: Rows | None = None) -> bytes:
         """A model that makes values ``outputs`` (any of the graph's, inner ones too) and nothing else.
 
-        Its inputs are those of the full graph that it needs; metadata are kept.
+        Its inputs are those of the full graph that it needs; metadata are kept. With ``rows`` it is evaluated for some
+        of so many alike, see ``Rows``.
 
         Raises:
             InputError: nothing in the graph makes one of them.
@@ -143,13 +154,36 @@ class OnnxFile:
             graph += node.data
         for name, constant in self._constants.items():
             if name in wanted:
-                graph += constant.data
+                graph += constant.data if rows is None else _with_rows(constant, rows)
         for name, data in self._input_data.items():
             if name in wanted:
                 graph += data
         for name in outputs:
             graph += bytes_field(_GRAPH_OUTPUT, bytes_field(1, name.encode()))
         return bytes(self._head + bytes_field(_MODEL_GRAPH, graph))
+
+
+def _with_rows(constant: Constant, rows: Rows) -> bytes | memoryview:
+    """The field of ``constant`` for some rows alone."""
+    by_row = constant.shape[:1] == (rows.total,)
+    sizes = () if by_row else constant.integers or ()
+    if not by_row and rows.total not in sizes:
+        return constant.data
+    ((_, tensor, _),) = _fields(constant.data)
+    fields = {number: value for number, value, _ in _fields(tensor) if number in (_TENSOR_RAW, _TENSOR_INT64)}
+    if by_row and _TENSOR_RAW not in fields:
+        raise InputError("constants of an ONNX model", expected="raw data", got="lists of numbers")
+    values = fields.get(_TENSOR_RAW, tensor[:0])
+    if by_row:
+        size = len(values) // rows.total
+        raw = b"".join(values[row * size : (row + 1) * size] for row in rows.kept)
+    else:
+        raw = struct.pack(f"<{len(sizes)}q", *(len(rows.kept) if size == rows.total else size for size in sizes))
+    changed = {_TENSOR_DIMS, *fields}
+    content = b"".join(record for number, _, record in _fields(tensor) if number not in changed)
+    for size in (len(rows.kept), *constant.shape[1:]) if by_row else constant.shape:
+        content += number_field(_TENSOR_DIMS, size)
+    return bytes_field(_GRAPH_INITIALIZER, content + bytes_field(_TENSOR_RAW, raw))
 
 
 def _node(data: memoryview, record: memoryview) -> Node:

@@ -63,6 +63,11 @@ class Camera:
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Camera(width, height, scale @ self.K, self.world_to_camera)
 
+    def cropped(self, rows: slice, columns: slice) -> Camera:
+        """The part of the view in these rows and columns of the image."""
+        shift: Floats = np.array([[1, 0, -columns.start], [0, 1, -rows.start], [0, 0, 1.0]])
+        return Camera(columns.stop - columns.start, rows.stop - rows.start, shift @ self.K, self.world_to_camera)
+
     def in_frame(self, frame_to_world: Floats) -> Camera:
         """The same view for points in another frame; ``frame_to_world`` [4, 4] is rigid, in m."""
         return shallow_copy(self, world_to_camera=self.world_to_camera @ frame_to_world)

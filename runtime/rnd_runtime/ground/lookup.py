@@ -115,18 +115,50 @@ def _read(to_map, x, row, values, out):  # type: ignore[no-untyped-def]
 def subtract_sun(to_map, values, share, remaining):  # type: ignore[no-untyped-def]
     """Subtract ``share`` [3] of a map's ``values`` [I, J] from every pixel of ``remaining`` [H, W, 3], not below 0."""
     height, width = remaining.shape[:2]
-    one, zero = np.float32(1), np.float32(0)
+    zero = np.float32(0)
     red, green, blue = share[0], share[1], share[2]
     for part in numba.prange(_PARTS):
         for y in range(part, height, _PARTS):
             row = y + 0.5
             low, high = _columns(to_map, row, values.shape[0], values.shape[1], width)
             for x in range(low, high):
-                i, j, a, b = _cell(to_map, x + 0.5, row, values.shape[0], values.shape[1])
-                near = values[i, j] * (one - b) + values[i, j + 1] * b
-                far = values[i + 1, j] * (one - b) + values[i + 1, j + 1] * b
-                blocked = near + (far - near) * a
+                blocked = _blocked(to_map, x, row, values)
                 if blocked > zero:
                     remaining[y, x, 0] = max(remaining[y, x, 0] - red * blocked, zero)
                     remaining[y, x, 1] = max(remaining[y, x, 1] - green * blocked, zero)
                     remaining[y, x, 2] = max(remaining[y, x, 2] - blue * blocked, zero)
+
+
+@numba.njit(inline="always", error_model="numpy")
+def _blocked(to_map, x, row, values):  # type: ignore[no-untyped-def]
+    i, j, a, b = _cell(to_map, x + 0.5, row, values.shape[0], values.shape[1])
+    near = values[i, j] * (_ONE - b) + values[i, j + 1] * b
+    far = values[i + 1, j] * (_ONE - b) + values[i + 1, j + 1] * b
+    return near + (far - near) * a
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def block_sun(to_map, values, blocked):  # type: ignore[no-untyped-def]
+    """Raise an image [H, W] of a sun's blocked share to a map's ``values`` [I, J]."""
+    height, width = blocked.shape
+    for part in numba.prange(_PARTS):
+        for y in range(part, height, _PARTS):
+            row = y + 0.5
+            low, high = _columns(to_map, row, values.shape[0], values.shape[1], width)
+            for x in range(low, high):
+                blocked[y, x] = max(blocked[y, x], _blocked(to_map, x, row, values))
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def add_lights(left, of_sky, blocked, shares):  # type: ignore[no-untyped-def]
+    """Make the share of the sky that is ``left`` [H, W, 3] that of all light, not below 0.
+
+    ``of_sky`` [3] of it is the sky's, ``shares`` [S, 3] are the suns', of which ``blocked`` [S, H, W] is blocked.
+    """
+    for y in numba.prange(left.shape[0]):
+        for x in range(left.shape[1]):
+            for c in range(3):
+                share = _ONE - of_sky[c] * (_ONE - left[y, x, c])
+                for sun in range(len(shares)):
+                    share -= shares[sun, c] * blocked[sun, y, x]
+                left[y, x, c] = max(share, np.float32(0))

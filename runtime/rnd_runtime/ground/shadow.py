@@ -8,7 +8,7 @@ Nothing is occluded twice, so energy is right for any light.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from rnd_runtime.core.arrays import floats, shallow_copy
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Gaussians
+from rnd_runtime.raster.oracle import NEAR
 from rnd_runtime.shading.directional import extract_directional
 from rnd_runtime.shading.light import Light
 
@@ -90,18 +91,24 @@ class Shadow:
 
     def remaining(self, camera: Camera, image: Floats32) -> Floats32:
         """Fill ``image`` [H, W, 3] with the share of the ground's irradiance at pixels that see the ground, else 1."""
-        to_plane = _image_to_plane(camera, self.plane)
+        to_plane = image_to_plane(camera, self.plane)
         step = int(min(float(sky.CELL) / self.pixel / 2, MAX_STEP)) // GROUP * GROUP or 1
-        sky_light(_compose(self.sky.to_cells, to_plane), self.sky.values, step, image)
+        sky_light(compose(self.sky.to_cells, to_plane), self.sky.values, step, image)
         for sun, share in self.suns:
-            subtract_sun(_compose(sun.to_cells, to_plane), sun.values, share, image)
+            subtract_sun(compose(sun.to_cells, to_plane), sun.values, share, image)
         return image
 
-    @property
-    def parts(self) -> list[Shadow]:
-        """That of the sky alone, then that of each sun alone."""
-        none = self.sky._replace(values=np.zeros_like(self.sky.values[:2, :2]))
-        return [replace(self, suns=()), *(replace(self, sky=none, suns=(sun,)) for sun in self.suns)]
+    def region(self, camera: Camera) -> tuple[slice, slice]:
+        """Rows and columns of the image that may see the shadow; all where a part of it is not in front of the eye."""
+        corners = np.concatenate([_corners(map_, self.plane) for map_ in (self.sky, *(sun for sun, _ in self.suns))])
+        seen = corners @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        size = np.array([camera.height, camera.width])
+        if seen[:, 2].min() < NEAR:
+            return slice(0, camera.height), slice(0, camera.width)
+        pixels = (seen[:, :2] / seen[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2])[:, ::-1]
+        low, high = np.floor(pixels.min(axis=0)), np.ceil(pixels.max(axis=0))
+        (top, left), (bottom, right) = (np.clip(edge, 0, size).astype(int).tolist() for edge in (low, high))
+        return slice(top, bottom), slice(left, right)
 
     def share_at(self, points: Floats) -> Floats:
         """Share [..., 3] of the irradiance at ``points`` [..., 2] m of the plane, in its axes; of the nearest cells."""
@@ -213,6 +220,14 @@ def footprint(camera: Camera, plane: Plane, at: Floats) -> float:
     return max(depth, 0.1) / float(camera.K[1, 1])
 
 
+def _corners(map_: Map, plane: Plane) -> Floats:
+    """Corners [4, 3] m of a map, half a cell beyond the centres of its outermost cells."""
+    rows, columns = map_.values.shape[:2]
+    cells = np.array([[i, j] for i in (-0.5, rows - 0.5) for j in (-0.5, columns - 0.5)])
+    on_plane = (cells - map_.to_cells[:, 2]) @ np.linalg.inv(map_.to_cells[:, :2]).T
+    return np.asarray(on_plane @ plane.axes[:2] + plane.offset * plane.normal, np.float64)
+
+
 def _nearest(map_: Map, points: Floats) -> Floats32:
     """Values of the cells at ``points`` [..., 2], 0 outside of the map."""
     cells = np.rint(points @ map_.to_cells[:, :2].T + map_.to_cells[:, 2])
@@ -228,7 +243,7 @@ def _to_cells(axes: Floats, low: Floats, cell: Floats) -> Floats:
     return np.column_stack([axes / cell[:, None], -low / cell - 0.5])
 
 
-def _image_to_plane(camera: Camera, plane: Plane) -> Floats:
+def image_to_plane(camera: Camera, plane: Plane) -> Floats:
     """[3, 3], (column, row, 1) → (x, y, 1) in the plane's axes, m, times a depth, positive where the plane is seen."""
     axes, position = plane.axes, camera.position
     rays = axes @ camera.rays.T  # (column, row, 1) → a direction in the plane's axes
@@ -242,5 +257,6 @@ def _image_to_plane(camera: Camera, plane: Plane) -> Floats:
     return rays
 
 
-def _compose(to_cells: Floats, to_plane: Floats) -> Floats:
+def compose(to_cells: Floats, to_plane: Floats) -> Floats:
+    """``Map.to_cells`` after ``image_to_plane``."""
     return np.concatenate([to_cells @ to_plane, to_plane[2:]])

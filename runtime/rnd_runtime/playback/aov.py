@@ -80,7 +80,7 @@ class Lit(NamedTuple):
     eye: NDArray[np.float64]
     seen: NDArray[np.bool_] | None
     radiance: Floats32
-    sunlit: Floats32
+    sunlit: Floats32 | None = None
 
     def again(self, gaussians: Gaussians, sunlit: Floats32 | None = None) -> Floats32:
         """Radiance [N, 3] of other ``gaussians``, or of others that are ``sunlit``."""
@@ -106,7 +106,9 @@ def splat_features(
         "visibility": lambda: ambient_visibility(gaussians)[:, None],
         "diffuse": lambda: lit.radiance - specular,
         "specular": lambda: specular,
-        "shadow": lambda: lit.again(gaussians, np.ones_like(lit.sunlit)) - lit.radiance,
+        "shadow": lambda: (
+            lit.again(gaussians, np.ones((len(lit.radiance), len(lit.shader.directional)), np.float32)) - lit.radiance
+        ),
     }
     return [given[name] if name in GIVEN else features[name]() for name in names if name != "depth"]
 

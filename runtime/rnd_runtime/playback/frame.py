@@ -361,11 +361,12 @@ def features_of(
     sunlit: Floats32 | None = None,
 ) -> Floats32:
     """Features [N, C] to splat: radiance if ``lit``, then those of the AOVs. ``sunlit``: as of ``Shader.shade``."""
-    if lit or {"diffuse", "specular", "shadow"} & {*aovs}:
-        sunlit = shader.sunlit(gaussians, visible) if sunlit is None else sunlit
+    again = {"diffuse", "specular", "shadow"} & {*aovs}
+    if again and sunlit is None:
+        sunlit = shader.sunlit(gaussians, visible)
+    radiance = np.empty((len(visible), 0), np.float32)
+    if lit or again:
         radiance = shader.shade(gaussians, camera.position, visible, sunlit=sunlit)
-    else:
-        radiance = sunlit = np.empty((len(visible), 0), np.float32)
     features = [radiance] if lit else []
     features += splat_features(aovs, gaussians, camera, Lit(shader, camera.position, visible, radiance, sunlit), given)
     return features[0] if len(features) == 1 else np.concatenate(features, axis=1)

@@ -21,6 +21,7 @@ from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.camera import Camera, Floats
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians, Raster
+from rnd_runtime.ground.several import remaining_of_several
 from rnd_runtime.ground.shadow import GroundLight, Plane, footprint
 from rnd_runtime.ground.standing import ground_of
 from rnd_runtime.motion.motion import Motion
@@ -36,9 +37,9 @@ from .frame import FrameRenderer, RenderedFrame, features_of, in_root_frame, spl
 from .framing import CameraPath, Framing, frame_motion
 
 _PART_OF_A_FRAME = 1e-4  # tolerance of rounded times
-LEVEL_SPACING = 0.24
-"""px, spacing of the Gaussians up to which a coarser level is taken: neighbouring levels then differ by 1/255 at most,
-as root mean square over the body's box (``rnd-bench scenes``)"""
+LEVEL_SPACING, NODE_SPACING = 0.35, 16.0
+"""px, spacings of the Gaussians and of the nodes up to which a coarser level is taken: neighbouring levels then differ
+by 1/255 at most, as root mean square over the body's box (``rnd-bench scenes``)"""
 HYSTERESIS = 1.15
 """factor on the distance between taking a coarser level and giving it back"""
 MAX_SHADOW_RESOLUTION = 4096
@@ -68,9 +69,10 @@ class Person:
         moved = self.motion.at(times_s - self.start).translations + self.avatar.skeleton.rest_joints[0]
         return np.asarray(moved @ self.place[:3, :3].T + self.place[:3, 3])
 
-    def encode(self, time_s: float) -> Encoded:
-        """Its pose at ``time_s`` of the scene."""
-        encoded = self.avatar.encode(self.motion, time_s - self.start)
+    def encode(self, time_s: float, level: int = 0) -> Encoded:
+        """Its pose at ``time_s`` of the scene, at a level of detail."""
+        avatar = self.avatar.levels[level] if level else self.avatar
+        encoded = avatar.encode(self.motion, time_s - self.start)
         return encoded._replace(root=self.place @ encoded.root)
 
 
@@ -98,13 +100,23 @@ def ground_under(people: Sequence[Person]) -> Plane:
     return min((ground_of(*pair) for pair in stands.values()), key=lambda plane: plane.offset)
 
 
-def chosen_levels(pixels_per_metre: Floats, spacings: Sequence[float]) -> NDArray[np.intp]:
-    """Level [F] of a body in F consecutive frames, by its size; ``spacings`` are the levels', m.
+def greatest_sizes(levels: Sequence[Avatar]) -> Floats:
+    """Pixels per metre [L], falling, up to which each of an avatar's levels is taken."""
+    whole = levels[0]
+    sizes = [
+        LEVEL_SPACING / level.spacing if level.gaussians < whole.gaussians else NODE_SPACING / level.node_spacing
+        for level in levels[1:]
+    ]
+    return np.minimum.accumulate([np.inf, *sizes])
 
-    The coarsest whose spacing is at most ``LEVEL_SPACING``; a coarser one than before only ``HYSTERESIS`` later.
+
+def chosen_levels(pixels_per_metre: Floats, greatest: Floats) -> NDArray[np.intp]:
+    """Level [F] of a body in F consecutive frames, by its size; ``greatest`` [L] as of ``greatest_sizes``.
+
+    The coarsest that may be taken; a coarser one than before only ``HYSTERESIS`` later.
     """
-    sizes = np.asarray(spacings)[:, None] * pixels_per_metre / LEVEL_SPACING  # [L, F]
-    coarsest, lagging = ((sizes[1:] * factor <= 1).sum(axis=0) for factor in (1.0, HYSTERESIS))
+    sizes = pixels_per_metre / greatest[1:, None]  # [L − 1, F]
+    coarsest, lagging = ((sizes * factor <= 1).sum(axis=0) for factor in (1.0, HYSTERESIS))
     levels: NDArray[np.intp] = lagging.copy()
     for frame in range(1, len(levels)):
         levels[frame] = np.clip(levels[frame - 1], lagging[frame], coarsest[frame])
@@ -138,13 +150,13 @@ class SceneRenderer:
         for number, person in enumerate(self.people):
             depths = (person.positions(times_s) * axes[:, :3]).sum(axis=1) + axes[:, 3] - MARGIN
             sizes = np.divide(axes[:, 4], depths, out=np.full(len(depths), np.inf), where=depths > NEAR)
-            if sizes.min() * person.avatar.spacing < LEVEL_SPACING:
-                levels[:, number] = chosen_levels(sizes, [level.spacing for level in person.avatar.levels])
+            if sizes.min() * person.avatar.node_spacing < NODE_SPACING:  # else they need not be made
+                levels[:, number] = chosen_levels(sizes, greatest_sizes(person.avatar.levels))
         return levels
 
-    def encode(self, time_s: float) -> list[Encoded]:
-        """Everybody's pose, for ``draw``."""
-        return [person.encode(time_s) for person in self.people]
+    def encode(self, time_s: float, levels: Sequence[int] | None = None) -> list[Encoded]:
+        """Everybody's pose, for ``draw``, at ``levels`` of detail; the finest by default, which ``given`` ones need."""
+        return [person.encode(time_s, level) for person, level in zip(self.people, levels or [0] * len(self.people))]
 
     def draw(
         self,
@@ -154,7 +166,6 @@ class SceneRenderer:
         aovs: Sequence[str] = (),
         srgb: bool = True,
         given: Sequence[Mapping[str, Floats32]] | None = None,
-        levels: Sequence[int] | None = None,
         change: Callable[[Gaussians], Gaussians] | None = None,
         ground_light: GroundLight | None = None,
     ) -> RenderedFrame:
@@ -162,7 +173,6 @@ class SceneRenderer:
 
         Args:
             aovs, srgb: as of ``FrameRenderer.draw``. given: the same of each person, for all of its Gaussians.
-            levels: of detail of each person, of ``levels``, where nothing is ``given``; the finest by default.
             change: what is shown in place of a body's Gaussians, where nothing is ``given``; the ground's shadow stays.
             ground_light: the renderer's by default.
         """
@@ -172,12 +182,9 @@ class SceneRenderer:
         seconds, started = {}, perf_counter()
         frame = bodies[0].root
         moved = [body.in_frame(frame) for body in bodies]
-        avatars = [person.avatar for person in self.people]
-        if levels is not None and not any(given):
-            avatars = [avatar.levels[level] if level else avatar for avatar, level in zip(avatars, levels)]
-        posed = [avatar.posed(body) for avatar, body in zip(avatars, moved)]
+        posed = [body.avatar.posed(body) for body in moved]
         shown = posed if change is None else [change(gaussians) for gaussians in posed]
-        joints = [avatar.joints(body) for avatar, body in zip(avatars, moved)]
+        joints = [body.avatar.joints(body) for body in moved]
         seconds["posing"], started = perf_counter() - started, perf_counter()
         shader, view = in_root_frame(frame, self.renderer.shader, camera)
         visible, features = self._shaded(shown, joints, shader, view, aovs, given)
@@ -306,26 +313,12 @@ class SceneRenderer:
         ground: Plane,
         light: GroundLight,
     ) -> Floats32:
-        """Share [H, W, 3] of the ground's light that everybody leaves.
-
-        Bodies hide different parts of the sky, as if by chance, and the same directional light: shares of the first
-        multiply, of the second the least counts.
-        """
-        plane = ground.in_frame(frame)
-        of_sky = np.maximum(light.sky.sum(axis=0) / np.maximum(light.irradiance, 1e-30), 1e-30).astype(np.float32)
-        shape = camera.height, camera.width, 3
-        sky, suns = np.ones(shape, np.float32), [np.ones(shape, np.float32) for _ in light.suns]
+        """Share [H, W, 3] of the ground's light that everybody leaves."""
+        plane, shadows = ground.in_frame(frame), []
         for gaussians, points in zip(posed, joints):
             pixel = footprint(camera, plane, plane.axes[:2] @ points[0])
-            shadow = light.shadow(gaussians, shadow_radii(gaussians), plane, frame[:3, :3], pixel=pixel)
-            if shadow is None:
-                continue
-            left = [part.remaining(camera, np.empty(shape, np.float32)) for part in shadow.parts]
-            sky *= np.maximum(1 - (1 - left[0]) / of_sky, 0)
-            for sun, here in zip(suns, left[1:]):
-                np.minimum(sun, here, out=sun)
-        whole: Floats32 = 1 - of_sky * (1 - sky) - sum((1 - sun for sun in suns), np.zeros(shape, np.float32))
-        return np.maximum(whole, 0, out=whole)
+            shadows.append(light.shadow(gaussians, shadow_radii(gaussians), plane, frame[:3, :3], pixel=pixel))
+        return remaining_of_several([shadow for shadow in shadows if shadow is not None], light, camera)
 
     def _together(self, name: str, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """``parts`` one after another, in an array that is kept from frame to frame."""

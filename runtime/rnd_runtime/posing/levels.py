@@ -18,14 +18,39 @@ from .rest import RestPose
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
-KEPT = 0.75
+KEPT = 0.9
 """share of the Gaussians that the next coarser level keeps"""
+NODES_SHARE = 4
+"""nodes for each one of coarser levels"""
 WINDOW = 96  # Gaussians along a space-filling curve among which a partner is searched
 MIN_COSINE = 0.6  # of the normals of a pair
 REACH = 2.5  # median distances to the nearest neighbour on the same side that a pair may be apart
 COLOUR_WEIGHT = 50.0  # of squared differences of albedo, against squared distances
 GROWTH = 0.5  # exponent: at 0 a body loses 1 % of its coverage in three levels, at 0.8 it gains 2 %
 _BITS = 10  # of a coordinate on the curve
+_ROWS = 1024  # Gaussians whose distances to all nodes are kept at once
+
+
+def on_fewer_nodes(rest: RestPose, kept: NDArray[np.int64]) -> RestPose:
+    """``rest`` interpolated between the nodes ``kept`` alone; each is where the Gaussians are that use it."""
+    points, used = rest.points.astype(np.float64), rest.neighbours.ravel()
+    weights = rest.neighbour_weights.ravel().astype(np.float64)
+    each = np.repeat(points, rest.neighbours.shape[1], axis=0)
+    sums = [np.bincount(used, weights * values, kept.max() + 1) for values in (*each.T, np.ones(len(each)))]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        nodes = np.stack(sums[:3], axis=1)[kept] / sums[3][kept, None]
+    nodes[~np.isfinite(nodes)] = np.inf  # no Gaussian uses it
+    count = min(rest.neighbours.shape[1], len(kept))
+    neighbours, squares = [], []
+    for part in np.array_split(points, len(points) // _ROWS + 1):
+        distances = ((part[:, None] - nodes) ** 2).sum(axis=2)
+        nearest = np.argpartition(distances, count - 1, axis=1)[:, :count]
+        neighbours.append(nearest)
+        squares.append(np.take_along_axis(distances, nearest, axis=1))
+    distances = np.concatenate(squares)
+    kernel = 1 / (distances + distances.min(axis=1).mean())
+    shares = (kernel / kernel.sum(axis=1, keepdims=True)).astype(np.float32)
+    return replace(rest, neighbours=np.concatenate(neighbours).astype(np.int32), neighbour_weights=shares)
 
 
 class Surface(NamedTuple):

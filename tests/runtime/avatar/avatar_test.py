@@ -42,6 +42,17 @@ def test_threads_do_not_change_a_frame(tiny_avatar) -> None:
     assert np.abs(one.visibility - two.visibility).max() < 1e-5
 
 
+def test_a_level_evaluates_the_same_networks_at_fewer_nodes(tiny_avatar) -> None:
+    avatar = Avatar.load(tiny_avatar)
+    level = avatar.levels[1]
+    assert (level.gaussians, level.nodes) == (avatar.gaussians, -(-avatar.nodes // 4))
+    every, some = (each.encode(motion(body()), 0.1).values for each in (avatar, level))
+    for whole, part in zip(every, some, strict=True):
+        np.testing.assert_allclose(part, whole[::4], atol=1e-5)
+    shift = level.pose(motion(body()), 0.1).means - avatar.pose(motion(body()), 0.1).means
+    assert 0 < np.sqrt((shift**2).mean()) < 2e-3  # m
+
+
 @pytest.mark.parametrize(
     ("changes", "line"),
     [

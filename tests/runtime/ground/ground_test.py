@@ -24,6 +24,7 @@ from rnd_bench.ground.judge import (
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.ground import sky
 from rnd_runtime.ground.lookup import sky_light
+from rnd_runtime.ground.several import remaining_of_several
 from rnd_runtime.ground.shadow import GroundLight, Map, Shadow, _cast, remaining_light
 from rnd_runtime.ground.stand_in import BANDS, StandIn
 from rnd_runtime.shading.light import Light
@@ -142,6 +143,21 @@ def test_a_shadow_turns_and_moves_with_its_frame():
     there = remaining_light(there, camera.in_frame(root))
     assert here.min() < 0.5 and here.max() == 1
     assert np.abs(here - there).mean() < 0.01  # the sky's cells lie elsewhere
+
+
+@pytest.mark.parametrize("eye", [[0.5, 1.6, 6.0], [0.2, 0.6, 0.8]])
+def test_one_of_several_shadows_is_the_body_s_own_in_a_part_of_the_image(eye):
+    """From afar its region is a part of the image; from among the body's own shadow it is all."""
+    light = GroundLight(probe(sun=400.0))
+    shadow = light.shadow(*body_surface(*posed_body(body(), 0.0)), GROUND, np.eye(3))
+    camera = Camera.look_at(eye, [0, 0, 0], width=200, height=120, fov_y=0.9)
+    alone = remaining_light(shadow, camera)
+    np.testing.assert_allclose(remaining_of_several([shadow], light, camera), alone, atol=1e-5)
+    rows, columns = shadow.region(camera)
+    outside = np.ones(alone.shape[:2], bool)
+    outside[rows, columns] = False
+    assert (alone[outside] == 1).all() and (alone < 0.9).any()
+    assert outside.any() == (eye[2] > 3)
 
 
 def test_a_turned_light_is_split_once():

@@ -11,7 +11,7 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.ground.shadow import Plane
 from rnd_runtime.playback.far import Extent, depth_groups
 from rnd_runtime.playback.frame import FrameRenderer
-from rnd_runtime.playback.scene import LEVEL_SPACING, Person, SceneRenderer, chosen_levels, frame_people, place_at
+from rnd_runtime.playback.scene import Person, SceneRenderer, chosen_levels, frame_people, greatest_sizes, place_at
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.raster.outline import sharpened
 from rnd_runtime.shading.light import Light, texel_directions
@@ -136,12 +136,20 @@ def test_a_heading_turns_to_the_left_and_the_camera_sees_everybody(avatar, motio
 
 
 def test_levels_follow_the_size_with_hysteresis():
-    spacings = [0.01, 0.02, 0.04]
-    at = [LEVEL_SPACING / spacing for spacing in spacings]  # px per metre up to which each is taken
+    at = np.array([np.inf, 50.0, 25.0])  # px per metre up to which each is taken
     sizes = np.array(
         [2 * at[1], at[1] / 1.05, at[1] / 1.2, at[1] / 1.05, at[1] * 1.01, at[2] / 2, np.inf, at[2] / 1.05]
     )
-    assert chosen_levels(sizes, spacings).tolist() == [0, 0, 1, 1, 0, 2, 0, 1]
+    assert chosen_levels(sizes, at).tolist() == [0, 0, 1, 1, 0, 2, 0, 1]
+
+
+def test_levels_have_fewer_and_fewer_nodes_and_gaussians(avatar):
+    levels = avatar.levels
+    assert levels[0] is avatar and levels[1].gaussians == avatar.gaussians
+    assert (np.diff([level.gaussians for level in levels[1:]]) < 0).all()
+    assert {level.nodes for level in levels[1:]} == {-(-avatar.nodes // 4)}
+    sizes = greatest_sizes(levels)
+    assert sizes[0] == np.inf and (np.diff(sizes) < 0).all()
 
 
 def test_far_people_get_coarser_levels_and_parts_of_a_run_the_same(avatar, motion):
@@ -159,8 +167,9 @@ def test_far_people_get_coarser_levels_and_parts_of_a_run_the_same(avatar, motio
         )
         np.testing.assert_array_equal(scene.levels(5, 30.0, camera_at), levels[:5])
         assert not SceneRenderer(people[:1], renderer).levels(8, 30.0, camera_at).any()
-        bodies, camera = scene.encode(0.2), camera_at(2, 0.0)
-        full, coarse = (scene.draw(bodies, camera, levels=chosen) for chosen in (None, levels[2].tolist()))
+        full, coarse = (
+            scene.draw(scene.encode(0.2, chosen), camera_at(2, 0.0)) for chosen in (None, levels[2].tolist())
+        )
     difference = np.sqrt(np.mean((full.srgb.astype(float) - coarse.srgb) ** 2))
     assert 0 < difference < 1
     np.testing.assert_allclose(coarse.alpha.sum(), full.alpha.sum(), rtol=0.04)

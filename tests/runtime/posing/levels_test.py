@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rnd_runtime.posing import levels
 from rnd_runtime.posing.levels import GROWTH, KEPT, Surface, coarser
 
 
@@ -31,8 +32,9 @@ def test_a_level_keeps_its_share_and_the_body(surface):
     assert np.ptp(level.rest.points, axis=0) == pytest.approx(np.ptp(surface.rest.points, axis=0), abs=0.02)
 
 
-def test_a_pair_is_merged_by_moments_and_grows(surface):
+def test_a_pair_is_merged_by_moments_and_grows(surface, monkeypatch):
     """Four points: two near one another and of one colour, two of other colours."""
+    monkeypatch.setattr(levels, "KEPT", 0.75)
     points = np.float32([[0, 0, 0], [0.01, 0, 0], [0, 0.012, 0], [0.01, 0.012, 0]])
     factors = np.zeros((4, 9), np.float32)
     factors[:, [0, 4, 8]] = [[0.01, 0.01, 0.001], [0.01, 0.01, 0.001], [0.01, 0.01, 0.001], [0.01, 0.01, 0.001]]

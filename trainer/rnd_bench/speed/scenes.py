@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -16,7 +17,7 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.motion.motion import Motion, load_motion
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
 from rnd_runtime.playback.framing import CameraOptions, front_path
-from rnd_runtime.playback.scene import LEVEL_SPACING, Person, SceneRenderer, chosen_levels, frame_people, place_at
+from rnd_runtime.playback.scene import Person, SceneRenderer, chosen_levels, frame_people, greatest_sizes, place_at
 from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.light import Light
 
@@ -26,7 +27,8 @@ BOX = 1.3  # heights, side of an image around a person
 HEIGHTS = (384, 192, 96, 64, 48, 32, 24, 16, 12)  # px
 VIEWS = ((0.3, 0.3), (1.1, 2.1), (2.0, 4.0))  # time of the motion, s, and azimuth, rad
 SIZE = (1280, 720)
-CROWDS = (1, 10, 50)
+CROWDS = {1: None, 10: None, 50: 100.0}
+"""numbers of people, and the height in pixels of those in the middle; None for a camera as near as shows all"""
 APART = 1.2  # m between neighbours of a crowd
 
 
@@ -46,8 +48,8 @@ def bench_scenes(
         add(_switch_row(avatar, number, motion, light))
     for pixels in HEIGHTS:
         add(_height_row(avatar, pixels, motion, light, repeats))
-    for count in CROWDS:
-        add(_crowd_row(avatar, count, motion, light, repeats))
+    for count, height in CROWDS.items():
+        add(_crowd_row(avatar, count, height, motion, light, repeats))
     return rows
 
 
@@ -75,12 +77,13 @@ def _difference(ours: Sequence[RenderedFrame], others: Sequence[RenderedFrame]) 
 def _switch_row(avatar: Avatar, number: int, motion: Motion, light: Light) -> dict[str, Any]:
     """Level ``number`` at the greatest height where it is taken, against the next finer one and the whole avatar."""
     level, finer = avatar.levels[number], avatar.levels[number - 1]
-    pixels = LEVEL_SPACING / level.spacing * HEIGHT
+    pixels = float(greatest_sizes(avatar.levels)[number]) * HEIGHT
     ours, others, whole = (_frames(each, pixels, motion, light) for each in (level, finer, avatar))
     coverage = sum(float(frame.alpha.sum()) for frame in ours) / sum(float(frame.alpha.sum()) for frame in whole)
     return {
         "kind": "switch",
         "gaussians": level.gaussians,
+        "nodes": level.nodes,
         "of": avatar.gaussians,
         "pixels": pixels,
         "rms_to_finer": _difference(ours, others),
@@ -91,8 +94,7 @@ def _switch_row(avatar: Avatar, number: int, motion: Motion, light: Light) -> di
 
 def _height_row(avatar: Avatar, pixels: int, motion: Motion, light: Light, repeats: int) -> dict[str, Any]:
     """The level that a person of ``pixels`` height gets, and the whole avatar."""
-    spacings = [level.spacing for level in avatar.levels]
-    level = avatar.levels[chosen_levels(np.array([pixels / HEIGHT]), spacings)[0]]
+    level = avatar.levels[chosen_levels(np.array([pixels / HEIGHT]), greatest_sizes(avatar.levels))[0]]
     ours, whole = (_frames(each, pixels, motion, light) for each in (level, avatar))
     row = {"kind": "height", "pixels": pixels, "gaussians": level.gaussians, "rms_to_whole": _difference(ours, whole)}
     for name, each in {"": level, "whole_": avatar}.items():
@@ -106,12 +108,17 @@ def _height_row(avatar: Avatar, pixels: int, motion: Motion, light: Light, repea
     return row
 
 
-def _crowd_row(avatar: Avatar, count: int, motion: Motion, light: Light, repeats: int) -> dict[str, Any]:
+def _crowd_row(
+    avatar: Avatar, count: int, pixels: float | None, motion: Motion, light: Light, repeats: int
+) -> dict[str, Any]:
     """``count`` people on a grid, all in view; motion and light change from frame to frame."""
     columns = int(np.ceil(np.sqrt(2 * count)))
     spots = [(APART * (k % columns), -APART * (k // columns)) for k in range(count)]
     people = [Person(avatar, motion, -0.17 * k, place_at(*spot, 0.7 * k)) for k, spot in enumerate(spots)]
-    path = front_path(frame_people(people), CameraOptions(*SIZE))
+    view = CameraOptions(*SIZE)
+    if pixels is not None:
+        view = replace(view, distance=SIZE[1] / 2 / np.tan(view.fov_y / 2) * HEIGHT / pixels)
+    path = front_path(frame_people(people), view)
     renderer = FrameRenderer(avatar, light)
     scene = SceneRenderer(people, renderer)
     levels = scene.levels(WARMUP + repeats, 1 / STEP_S, path)
@@ -119,10 +126,10 @@ def _crowd_row(avatar: Avatar, count: int, motion: Motion, light: Light, repeats
 
     def draw(number: int) -> None:
         started = perf_counter()
-        bodies = scene.encode(STEP_S * number)
+        bodies = scene.encode(STEP_S * number, levels[number].tolist())
         renderer.turn(STEP_YAW * number)
         spent = {"encoders": perf_counter() - started}
-        frame = scene.draw(bodies, path(number, STEP_S * number), levels=levels[number].tolist())
+        frame = scene.draw(bodies, path(number, STEP_S * number))
         for stage, seconds in (spent | dict(frame.stage_seconds)).items():
             stages.setdefault(stage, []).append(1e3 * seconds)
 

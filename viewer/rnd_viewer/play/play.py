@@ -31,7 +31,7 @@ from rnd_runtime.ground.shadow import Plane
 from rnd_runtime.ground.standing import UP
 from rnd_runtime.motion.motion import Motion, motion_inputs
 from rnd_runtime.motion.planting import feet_slide
-from rnd_runtime.playback.aov import parse_aovs
+from rnd_runtime.playback.aov import GIVEN, parse_aovs
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
 from rnd_runtime.playback.framing import CameraOptions, CameraPath, Framing, front_path, orbit_path
 from rnd_runtime.playback.scene import SceneRenderer, frame_people, ground_under
@@ -270,7 +270,8 @@ class _Run:
     def _encode(self, number: int) -> _Pending:
         asked = perf_counter()
         with self.times.stage("encoders"):
-            moments = [self.scene.encode((number + offset) / self.fps) for offset in self.sampling.offsets]
+            levels = None if {*GIVEN} & {*self.aovs} else self._levels[number]
+            moments = [self.scene.encode((number + offset) / self.fps, levels) for offset in self.sampling.offsets]
             return _Pending(asked, moments)
 
     def _draw(self, number: int, pending: _Pending) -> tuple[RenderedFrame, Camera]:
@@ -293,7 +294,7 @@ class _Run:
         if lighting.hdr_turn:
             self.renderer.turn(math.radians(lighting.hdr_yaw) + math.tau * time_s / lighting.hdr_turn)
         given = [of.of(number, body, camera) for of, body in zip(self._given, encoded)]
-        frame = self.scene.draw(encoded, camera, aovs=self.aovs, srgb=False, given=given, levels=self._levels[number])
+        frame = self.scene.draw(encoded, camera, aovs=self.aovs, srgb=False, given=given)
         started = perf_counter()
         frame = self.backdrop.behind(frame, camera, self.renderer.light)
         return replace(frame, stage_seconds={**frame.stage_seconds, "background": perf_counter() - started})

@@ -34,7 +34,7 @@ class CastScene(Scene):
     def __init__(self, options: ViewOptions) -> None:
         super().__init__(options)
         self._all = SceneRenderer(self.people, self.renderer)
-        self._encoded: tuple[float, list[Encoded]] | None = None
+        self._encoded: tuple[float, list[int], list[Encoded]] | None = None
 
     def _load(self, options: ViewOptions, ahead: Future[Networks] | None) -> None:
         self.people = load_people(read_scene(options.avatar), options.reading, options.albedo_gain, options.threads)
@@ -75,24 +75,23 @@ class CastScene(Scene):
     def _draw(
         self, state: ViewState, camera: Camera, motion: Motion, time_s: float, grounded: bool, seconds: dict[str, float]
     ) -> RenderedFrame:
-        bodies = self._encode(time_s, seconds)
-        levels = self._all.levels(1, motion.fps, lambda frame, at: camera, start=time_s)[0].tolist()
+        bodies = self._encode(time_s, camera, seconds)
         self.renderer.ground = self._plane if grounded else None
         light = self._turned_ground_light(state) if grounded else None
         change = partial(self._changed, state)
-        how = {"aovs": aovs_of(state), "levels": levels, "change": change, "ground_light": light}
-        return self._all.draw(bodies, camera, srgb=False, **how)
+        return self._all.draw(bodies, camera, aovs=aovs_of(state), srgb=False, change=change, ground_light=light)
 
-    def _encode(self, time_s: float, seconds: dict[str, float]) -> list[Encoded]:
-        """Cached while only camera and light move."""
-        if self._encoded is None or self._encoded[0] != time_s:
+    def _encode(self, time_s: float, camera: Camera, seconds: dict[str, float]) -> list[Encoded]:
+        """At the levels of detail of ``camera``; cached while these and the time stay."""
+        levels = self._all.levels(1, self.motion.fps, lambda frame, at: camera, start=time_s)[0].tolist()
+        if self._encoded is None or self._encoded[:2] != (time_s, levels):
             started = perf_counter()
-            self._encoded = time_s, self._all.encode(time_s)
+            self._encoded = time_s, levels, self._all.encode(time_s, levels)
             seconds["encoders"] = perf_counter() - started
-        return self._encoded[1]
+        return self._encoded[2]
 
     def _joints(self, motion: Motion, time_s: float, camera: Camera) -> Floats32:
-        bodies = self._encode(time_s, {})
-        inside = [person.avatar.joints(body) for person, body in zip(self.people, bodies)]
+        bodies = self._encode(time_s, camera, {})
+        inside = [body.avatar.joints(body) for body in bodies]
         world = [points @ body.root[:3, :3].T + body.root[:3, 3] for points, body in zip(inside, bodies)]
         return projected(np.concatenate(world), camera)
