@@ -62,7 +62,8 @@ def match_joints(
 
     Uses the naming of ``joint_names.toml`` that matches most joints and contradicts ``bones`` least: "LeftShoulder"
     may be a collar bone or a shoulder, "LeftLeg" a thigh or a shin. Joints that it lacks come from other namings,
-    where ``bones`` agree. Entries of ``extra``, read from ``file``, take precedence.
+    where ``bones`` agree, or from their place between others. Entries of ``extra``, read from ``file``, take
+    precedence.
 
     Raises:
         InputError: ``extra`` names unknown joints, or no naming matches enough.
@@ -88,6 +89,8 @@ def match_joints(
                 new = joint not in matched and index not in matched.values()
                 if new and bones.contradictions(more) <= bones.contradictions(matched):
                     matched = more
+        between = bones.between(matched)
+        matched |= {joint: index for joint, index in between.items() if joint in ours and joint not in given}
         spine = {joint: index for joint, index in bones.spine(matched).items() if joint in ours}
         if spine and not given.keys() & spine.keys():
             matched = {joint: index for joint, index in matched.items() if not joint.startswith("spine")} | spine

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 _SHARED = 0.8  # of the joints have what says nothing
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_NUMBER = re.compile(r"(?<=.)_\d+$")
 _SIDES = {"l": "left", "left": "left", "r": "right", "right": "right"}
 _MIDDLE = ("c", "m", "mid", "center")
 _SEPARATORS = str.maketrans("", "", "_-. |")
@@ -38,7 +39,10 @@ def keys(names: Sequence[str]) -> list[dict[str, int]]:
 
 
 def _without_shared(names: list[str]) -> list[str]:
-    """``names`` without the prefix and the suffix that most of them share."""
+    """``names`` without the prefix and the suffix that most of them share, such as each one's "_" and number."""
+    numbered = [_NUMBER.sub("", name) for name in names]
+    if sum(map(str.__ne__, names, numbered)) >= _SHARED * len(names):
+        names = numbered
     prefix = _common(names)
     names = [name.removeprefix(prefix) or name for name in names]
     suffix = _common([name[::-1] for name in names])[::-1]

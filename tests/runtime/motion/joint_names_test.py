@@ -47,6 +47,7 @@ SPELLINGS = {
     "LAFAN1": (_TRUNK | _ARMS | _LEGS | {"*_foot": "Toe"}, "{side}{name}", ("Left", "Right")),
     "underscore": (_TRUNK | _ARMS | _LEGS, "mixamorig_{side}{name}", ("Left", "Right")),
     "number": (_TRUNK | _ARMS | _LEGS, "mixamorig1{side}{name}", ("Left", "Right")),
+    "number of each": (_TRUNK | _ARMS | _LEGS, "mixamorig:{side}{name}_0{joint}", ("Left", "Right")),
     "path": (_TRUNK | _ARMS | _LEGS, "Armature|mixamorig:{side}{name}", ("Left", "Right")),
     "suffix": ({k: v.lower() for k, v in (_TRUNK | _ARMS | _LEGS).items()}, "{side}_{name}_JNT", ("l", "r")),
     "side last": (_TRUNK | _ARMS | _LEGS, "{name}.{side}", ("L", "R")),
@@ -90,13 +91,13 @@ def _spelled(names: dict[str, str], form: str, sides: tuple[str, str]) -> dict[s
     for ours, name in names.items():
         for side, theirs in zip(("left", "right"), sides) if "*" in ours else (("", middle),):
             full = (
-                form.format(side=theirs, name=name)
+                form.format(side=theirs, name=name, joint="{joint}")
                 if theirs
                 else form.replace("{side}_", "")
                 .replace("_{side}", "")
                 .replace(".{side}", "")
                 .replace("{side}", "")
-                .format(name=name)
+                .format(name=name, joint="{joint}")
             )
             spelled[ours.replace("*", side)] = full
     return spelled
@@ -106,6 +107,7 @@ def _spelled(names: dict[str, str], form: str, sides: tuple[str, str]) -> dict[s
 def test_joints_are_found_however_they_are_spelled(spelling):
     """None is missed or another's; a joint of the spine without a known name is found by its place."""
     spelled = _spelled(*SPELLINGS[spelling])
+    spelled = {name: theirs.format(joint=SMPL_NAMES.index(name)) for name, theirs in spelled.items()}
     theirs = [spelled.get(name, f"extra{joint}") for joint, name in enumerate(SMPL_NAMES)]
     matched = match_joints(theirs, SMPL_NAMES, bones=_TREE)
     known = spelled if "spine2" in spelled else spelled | {"spine2": "extra6"}
@@ -119,6 +121,44 @@ def test_the_tree_decides_whether_a_leg_is_a_thigh():
         theirs = [spelled.get(name, f"extra{joint}") for joint, name in enumerate(SMPL_NAMES)]
         matched = match_joints(theirs, SMPL_NAMES, bones=_TREE)
         assert {name: theirs[index] for name, index in matched.items()} == spelled
+
+
+@pytest.mark.parametrize(
+    "unknown",
+    [
+        {"*_elbow": "Arm1"},  # BEAT's
+        {"*_knee": "LoLeg"},
+        {"*_collar": "Thorax"},
+        {"neck": "NeckTwist01"},  # Character Creator's
+        {"pelvis": "SpineBase", "spine2": "SpineMid"},  # Kinect's
+        {"*_elbow": "Arm1", "neck": "b_neck0", "*_collar": "Thorax", "pelvis": "Base", "spine3": "Ribs"},
+    ],
+    ids=lambda unknown: ", ".join(unknown),
+)
+def test_joints_between_known_ones_are_found_by_their_place(unknown):
+    spelled = _spelled(_TRUNK | _ARMS | _LEGS | unknown, "{side}{name}", ("Left", "Right"))
+    theirs = [spelled.get(name, f"extra{joint}") for joint, name in enumerate(SMPL_NAMES)]
+    matched = match_joints(theirs, SMPL_NAMES, bones=_TREE)
+    assert {name: theirs[index] for name, index in matched.items()} == spelled
+
+
+def test_the_chest_carries_the_arms_whatever_lies_between_it_and_the_neck():
+    """A joint between chest and neck is none of the three of the spine."""
+    names = ["Hips", "Spine", "Chest", "neckDummy", "Neck", "Head"]
+    parents = [-1, 0, 1, 2, 3, 4]
+    for side in ("Left", "Right"):
+        for above, parts in ((2, ("Collar", "Shoulder", "Elbow", "Wrist")), (0, ("Hip", "Knee", "Ankle"))):
+            for part in parts:
+                parents.append(above)
+                names.append(side + part)
+                above = len(names) - 1
+    matched = match_joints(names, SMPL_NAMES, bones=Bones(parents, np.full((len(names), 3), 0.1)))
+    assert {names[matched[joint]]: joint for joint in ("spine1", "spine3", "neck")} == {
+        "Spine": "spine1",
+        "Chest": "spine3",
+        "Neck": "neck",
+    }
+    assert "spine2" not in matched
 
 
 @pytest.mark.parametrize("file", sorted((CASES / "bvh_prefixed_names").glob("*.bvh")), ids=lambda file: file.stem)

@@ -1,7 +1,7 @@
 """Where heads, hands and feet end: BVH's end sites, and joints below the last that is known.
 
 Some programs write an end site that says nothing: along the bone's own Y, whatever that is. One counts only where a
-person's may be.
+person's may be, and not where all are along an axis that bones are not along.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ _NEXT = {"ankle": "foot", "wrist": "hand", "neck": "head"}
 _BEFORE = {"neck": ("spine3", "spine2", "spine1"), "wrist": ("*_elbow",), "ankle": ("*_knee",)}
 _ANGLES = {"neck": (0.0, 60.0), "wrist": (0.0, 60.0), "ankle": (40.0, 140.0)}
 _SHORTEST = 0.03  # of a leg
+_SEVERAL, _ALONG = 3, np.cos(np.radians(5))
 
 
 def find_tips(tree: MocapTree, positions: Floats, rotations: Floats, matched: Mapping[str, int]) -> dict[str, Floats]:
@@ -30,15 +31,24 @@ def find_tips(tree: MocapTree, positions: Floats, rotations: Floats, matched: Ma
     for joint in matched.values():
         while (joint := tree.parents[joint]) >= 0:
             above.add(joint)
-    found = {}
+    found, ends = {}, {} if _one_axis(tree) else tree.ends
     for name, joint in matched.items():
         if joint in above:
             continue
         below = [child for child, parent in enumerate(tree.parents) if parent == joint]
-        offset = tree.ends.get(joint) if not below else tree.offsets[below[0]] if len(below) == 1 else None
+        offset = ends.get(joint) if not below else tree.offsets[below[0]] if len(below) == 1 else None
         if offset is not None:
             found[name] = positions[:, joint] + rotations[:, joint] @ offset
     return found
+
+
+def _one_axis(tree: MocapTree) -> bool:
+    """Whether all of several end sites are along one axis, and most bones of ``tree`` are not."""
+    ends = [unit(end) for end in tree.ends.values() if np.any(end)]
+    if len(ends) < _SEVERAL or min(float(end @ ends[0]) for end in ends) < _ALONG:
+        return False
+    bones = unit(tree.offsets[np.any(tree.offsets, axis=-1)])
+    return bool(np.median(bones @ ends[0]) < _ALONG)
 
 
 def with_tips(points: Mapping[str, Floats], tips: Mapping[str, Floats]) -> dict[str, Floats]:

@@ -62,6 +62,15 @@ def test_what_is_held_throughout_the_clip_is_seen_by_its_end(joint, vector, end)
     assert _apart(_retargeted(rotations, {joint: aside}), rotations, joint) > 30
 
 
+def test_ends_along_one_axis_of_bones_in_any_axes_say_nothing():
+    """As programs write them that know no ends: "0 5 0" below each last joint."""
+    zero = random_rotations(np.random.default_rng(2), 24)  # a toe's Y is where a toe may point
+    known = tree(MATRICES, PELVIS, zero)
+    ends = {MATCHED[name]: 0.05 * np.array([0, 1.0, 0]) for name in ("head", "left_foot", "right_foot")}
+    plain, other = (retarget(one, SKELETON, MATCHED) for one in (known, replace(known, ends=ends)))
+    assert_same_poses(other.rotations, plain.rotations, degrees=0.01)
+
+
 def test_a_small_difference_is_where_a_program_puts_the_top_of_a_head():
     tilted = Rotation.from_rotvec([0.4, 0, 0]).as_matrix() @ UP
     plain, other = (_retargeted(MATRICES, ends) for ends in ({}, {"head": tilted}))
