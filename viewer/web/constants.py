@@ -53,6 +53,10 @@ SHARED = {
     "rnd_runtime.playback.aov": "MIN_COVERAGE",
     "rnd_runtime.playback.far": "MIN_PIXELS_PER_METRE MAX_FACTOR MARGIN",
     "rnd_runtime.playback.framing": "PADDING ELEVATION FIELD_OF_VIEW",
+    "rnd_runtime.ground.standing": "FRAMES STANDING",
+    "rnd_runtime.ground.stand_in": "MAX_DISCS GROWN LARGEST_DISC SINK BANDS",
+    "rnd_runtime.ground.sky": "CELL REACH CELLS _SLICE _MAX_SLICES _GAP",
+    "rnd_runtime.ground.shadow": "SKY_DIRECTIONS SUN_CELLS SUN_CELL SUN_REACH MIN_ELEVATION BOX",
     "rnd_viewer.view.scene": "CLAY LARGEST_SKY",
 }
 

@@ -12,7 +12,7 @@ from rnd_runtime.core.arrays import Floats32, floats
 from rnd_runtime.core.gaussians import Gaussians
 
 MAX_DISCS = 4096
-GROWN, LARGEST = np.float32(1.2), np.float32(0.045)
+GROWN, LARGEST_DISC = np.float32(1.2), np.float32(0.045)
 """factor on the discs' radii that closes the gaps of a thinned body; their bound, m, about that of a forearm"""
 SINK = np.float32(0.8)
 """of a disc's radius, by which its centre lies below the surface"""
@@ -62,7 +62,7 @@ def _thinned(means, normals, radii, axes, offset, bands):  # type: ignore[no-unt
         seen += 1
         if (seen - 1) % step:
             continue
-        radius = min(radii[i] * grown, LARGEST)
+        radius = min(radii[i] * grown, LARGEST_DISC)
         x = means[i, 0] - SINK * radius * normals[i, 0]
         y = means[i, 1] - SINK * radius * normals[i, 1]
         z = means[i, 2] - SINK * radius * normals[i, 2]

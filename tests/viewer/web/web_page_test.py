@@ -314,7 +314,7 @@ def test_the_pixels_are_rnd_plays(loaded, site, tmp_path):
     options = ["--size", str(SIZE), "--frames", f"{FRAME}:{FRAME + 1}", "--format", "png", "--raster", "cpu"]
     light = ["--background", "hdr", "--hdr-yaw", "40", "--exposure", "0.5"]
     assert play([*inputs, *options, *light, "--out", str(tmp_path)]) == 0
-    state = {"width": SIZE, "height": SIZE, "time": FRAME / 30, "light": 1}
+    state = {"width": SIZE, "height": SIZE, "time": FRAME / 30, "light": 1, "ground": False}
     got = _frame(loaded, **state, background="hdr", yaw=np.radians(40), exposure=0.5)
     expected = read_image(tmp_path / f"frames/{FRAME:06d}.png")
     _assert_close(got, expected)
@@ -332,6 +332,7 @@ def test_every_state_has_rnd_views_pixels(loaded, site):
         "shade": "table+sun",
         "background": "none",
         "tone": "srgb",
+        "ground": False,
         "gaussians": None,
         "width": SIZE,
         "height": SIZE,
@@ -344,6 +345,11 @@ def test_every_state_has_rnd_views_pixels(loaded, site):
         {"exposure": 2.0, "tone": "neutral", "background": "hdr"},
         {"exposure": 1.0, "tone": "neutral", "background": "#ffd080"},
         {"output": "albedo", "tone": "neutral", "azimuth": 0.4},
+        # on the ground: shadows of a sun and of the sky, seen from above, from afar and from below
+        {"background": "#808080", "ground": True, "yaw": 0.7, "elevation": 0.6, "time": 0.3},
+        {"background": "hdr", "ground": True, "light": 2, "yaw": -1.2, "distance": 9.0, "tone": "neutral"},
+        {"background": "#c08040", "ground": True, "light": 0, "output": "light", "gaussians": 3000},
+        {"background": "#ffffff", "ground": True, "elevation": -0.4},
         {"azimuth": 2.0, "elevation": 0.5, "distance": 1.9, "fov": 0.9},
         *({"output": name} for name in ("light", "albedo", "normal", "roughness", "visibility")),
         {"gaussians": 3000, "azimuth": -1.0},
@@ -364,6 +370,9 @@ def test_every_state_has_rnd_views_pixels(loaded, site):
         _assert_agreed(loaded, got, scene)
         seen.add(got.tobytes())
     assert len(seen) == len(states)
+    grey = straight | {"background": "#808080"}
+    bare, shadowed = (_frame(loaded, **(grey | {"ground": on})) for on in (False, True))
+    assert (shadowed < bare).all(-1).mean() > 0.03
     scene.close()
 
 

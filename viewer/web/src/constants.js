@@ -134,6 +134,29 @@ export const MARGIN = 0.35;
 export const PADDING = 0.14;
 export const ELEVATION = 5.0;
 export const FIELD_OF_VIEW = 35.0;
+// rnd_runtime.ground.standing
+export const FRAMES = 24;
+export const STANDING = 25;
+// rnd_runtime.ground.stand_in
+export const MAX_DISCS = 4096;
+export const GROWN = 1.2000000476837158;
+export const LARGEST_DISC = 0.04500000178813934;
+export const SINK = 0.800000011920929;
+export const BANDS = [0.11999999731779099, 0.30000001192092896, 0.6000000238418579, 1.0, 1.5];
+// rnd_runtime.ground.sky
+export const CELL = 0.05000000074505806;
+export const REACH = 2.4;
+export const CELLS = 96;
+export const SLICE = 0.05000000074505806;
+export const MAX_SLICES = 64;
+export const GAP = 1.5;
+// rnd_runtime.ground.shadow
+export const SKY_DIRECTIONS = 128;
+export const SUN_CELLS = 512;
+export const SUN_CELL = [0.006, 0.05];
+export const SUN_REACH = 8.0;
+export const MIN_ELEVATION = 0.05235987755982989;
+export const BOX = 1.224744871391589;
 // rnd_viewer.view.scene
 export const CLAY = 0.800000011920929;
 export const LARGEST_SKY = 1024;

@@ -5,6 +5,7 @@ import { Avatar } from "./posing/avatar.js";
 import { cameraOf } from "../../rnd_viewer/view/page/camera.js";
 import { homeView, inFrame, projectJoints } from "./camera.js";
 import { inFile, refusal } from "./errors.js";
+import { groundLight, groundOf, groundShadow } from "./ground/ground.js";
 import { brightestDirection, downsize, lightNotes, readLight } from "./shading/light.js";
 import { fitMotion, restMotion } from "./motion/motion.js";
 import { readMotionFile } from "./files/motion_files.js";
@@ -17,14 +18,18 @@ import { Splatter } from "./raster/splat.js";
 
 const SIZE = [512, 512], SIZES = [64, 1024];  // px: default, least and largest
 
+// of a camera that sees no ground
+const NO_SHADOW = Object.fromEntries(["ground", "sun0", "sun1"].map((name) => [`to_${name}`, new Float32Array(9)]));
+
 let splatter = new Splatter();
-// record: the motion in its file's axes (null: at rest); lights: {name, light, notes, shaders: Map of shade → function}
-let scene = { avatar: null, record: null, motion: null, lights: [] };
+// record: the motion in its file's axes (null: at rest); ground: its height m, once drawn; lights: {name, light, notes, shaders: Map of
+// shade → function, ground: once drawn}
+let scene = { avatar: null, record: null, motion: null, ground: null, lights: [] };
 let posed = null, shownSky = null;
 
 /** Load files [{name, bytes}], all or none, and post the new scene. */
 async function load(files) {
-  const before = scene, next = { ...scene }, opened = [];
+  const before = scene, next = { ...scene, ground: null }, opened = [];
   let answer = null;
   try {
     for (const file of files) await take(file, next, opened).catch((error) => { throw inFile(error, file.name); });
@@ -70,12 +75,18 @@ function description({ avatar, motion, lights }, light) {
     motion: { name: motion.name, duration: motion.duration, fps: motion.fps },
     lights: lights.map(({ name }) => name), light,
     head: avatar.skeleton.names.indexOf("head"), fit: true, size: SIZE, sizes: SIZES, raster: splatter.name, view: homeView(avatar.skeleton, motion),
-    truths: [], notes: motion.notes,
+    truths: [], ground: true, notes: motion.notes,
   };
 }
 
 async function render({ number, state }) {
-  const clock = lap(), { avatar, motion } = scene;
+  const clock = lap(), { avatar, motion } = scene, lit = state.output === "lit" || state.output === "light";
+  const grounded = lit && state.ground && state.background !== "none";
+  if (grounded && scene.ground === null) {
+    posed = null;  // whose arrays it fills
+    scene.ground = await groundOf(avatar, motion);
+    clock("ground");
+  }
   if (!posed || posed.time !== state.time) {
     const encoded = await avatar.encode(motion, state.time);
     clock("encoders");
@@ -84,7 +95,7 @@ async function render({ number, state }) {
   }
   const camera = cameraOf(state), count = Math.min(state.gaussians ?? avatar.gaussians, avatar.gaussians);
   const grown = avatar.gaussians / count, gaussians = fewer(posed.gaussians, count), beside = inFrame(camera, gaussians.root);
-  const features = state.output === "lit" || state.output === "light"
+  const features = lit
     ? radianceOf(state, gaussians, count, beside.position, grown) : material(state.output, gaussians, count, beside);
   clock("shading");
   const view = fineView(beside, gaussians.rootJoints), records = project(gaussians, count, features, view.camera, grown, avatar.cull);
@@ -93,7 +104,10 @@ async function render({ number, state }) {
     splatter = new Splatter();
     shownSky = null;
   }
-  splatter.draw(records, view, state.width, state.height, look(state, camera));
+  const shadow = grounded ? shadowOf(state, posed.gaussians, beside) : null;
+  if (shadow) splatter.setGround(shadow.maps);
+  if (grounded) clock("ground");
+  splatter.draw(records, view, state.width, state.height, { ...look(state, camera), ...NO_SHADOW, ...shadow?.uniforms });
   if (splatter.isLost()) throw new Error("the browser took WebGL2 away while it drew; it is asked for again with the next frame");
   const image = splatter.canvas.transferToImageBitmap();
   clock("splatting");
@@ -145,6 +159,13 @@ function material(output, { albedo, normals, roughness, visibility }, count, { r
     }
   }
   return features;
+}
+
+/** Of the whole body, as in rnd-view. */
+function shadowOf(state, gaussians, camera) {
+  const entry = scene.lights[state.light];
+  entry.ground ??= groundLight(entry.light);
+  return groundShadow(entry.ground, gaussians, camera, scene.ground, lightToWorld(state.yaw));
 }
 
 /** Uniforms of blend.frag. */

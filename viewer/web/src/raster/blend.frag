@@ -13,6 +13,9 @@ uniform int show;            // 0 radiance, 1 normals, 2 a number
 uniform int background;      // 0 one colour, 1 the sky
 uniform vec3 colour;         // linear
 uniform mat3 pixel_to_light; // (column, row, 1) → direction in the light's frame
+uniform sampler2D ground, sun0, sun1;  // blocked shares of the ground's light; of each sun's
+uniform mat3 to_ground, to_sun0, to_sun1;  // (column, row, 1) → a map's row and column and 1, times a depth
+uniform vec3 share0, share1;  // the suns' of the ground's light
 uniform float gain;
 uniform int curved;          // 1: tone curve "neutral"
 out vec4 image;
@@ -68,6 +71,25 @@ vec3 sample_sky(vec3 d) {
     return mix(upper, lower, part.y);
 }
 
+/** Bilinear; 0 outside of the map, and where the ground is not seen (rnd_runtime/ground/lookup.py). */
+vec3 blocked(sampler2D map, mat3 to_map, vec2 at) {
+    vec3 place = to_map * vec3(at, 1.0);
+    ivec2 last = textureSize(map, 0).yx - 1;
+    vec2 cell = place.xy / place.z;
+    if (!(place.z > 1e-9) || any(lessThan(cell, vec2(0.0))) || any(greaterThan(cell, vec2(last)))) return vec3(0.0);
+    ivec2 first = min(ivec2(cell), last - 1);
+    vec2 part = cell - vec2(first);
+    vec3 near = mix(texelFetch(map, first.yx, 0).rgb, texelFetch(map, first.yx + ivec2(1, 0), 0).rgb, part.y);
+    vec3 far = mix(texelFetch(map, first.yx + ivec2(0, 1), 0).rgb, texelFetch(map, first.yx + 1, 0).rgb, part.y);
+    return mix(near, far, part.x);
+}
+
+/** Share of the ground's light that the body leaves. */
+vec3 left_on_ground(vec2 at) {
+    vec3 sky = blocked(ground, to_ground, at);
+    return max(1.0 - sky - share0 * blocked(sun0, to_sun0, at).r - share1 * blocked(sun1, to_sun1, at).r, 0.0);
+}
+
 vec3 srgb(vec3 linear) {
     vec3 x = max(linear, 0.0);
     return mix(1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, 12.92 * x, vec3(lessThanEqual(x, vec3(0.0031308))));
@@ -90,6 +112,7 @@ void main() {
     vec3 result;
     if (show == 0) {
         vec3 far = background == 1 ? gain * sample_sky(pixel_to_light * vec3(vec2(at) + 0.5, 1.0)) : colour;
+        far *= left_on_ground(vec2(at) + 0.5);
         float a = value.a > 0.0 ? value.a : 1.0;
         vec3 light = value.rgb + (1.0 - value.a) * far;
         if (curved == 1) light = background == 1 ? neutral(light) : a * neutral(value.rgb / a) + (1.0 - value.a) * far;

@@ -12,7 +12,8 @@ const MACROS = Object.entries({
   NEUTRAL_OFFSET, NEUTRAL_START, NEUTRAL_DESATURATION,
 }).map(([name, value]) => `#define ${name} ${value}\n`).join("");
 const FULLSCREEN = "void main() { gl_Position = vec4(vec2(gl_VertexID % 2, gl_VertexID / 2) * 4.0 - 1.0, 0.0, 1.0); }";
-const TEXTURES = ["records", "pairs", "tiles", "sky"];  // by unit
+const TEXTURES = ["records", "pairs", "tiles", "sky", "ground", "sun0", "sun1"];  // by unit
+const NO_SUN = { width: 2, values: new Float32Array(4) };
 
 export class Splatter {
   constructor() {
@@ -23,7 +24,8 @@ export class Splatter {
     this.program = new Program(gl, HEAD + FULLSCREEN, HEAD + MACROS + blendFragment);
     this.largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.formats = {
-      records: [gl.RGBA32F, gl.RGBA, gl.FLOAT], sky: [gl.RGBA32F, gl.RGBA, gl.FLOAT],
+      records: [gl.RGBA32F, gl.RGBA, gl.FLOAT], sky: [gl.RGBA32F, gl.RGBA, gl.FLOAT], ground: [gl.RGBA32F, gl.RGBA, gl.FLOAT],
+      sun0: [gl.R32F, gl.RED, gl.FLOAT], sun1: [gl.R32F, gl.RED, gl.FLOAT],
       pairs: [gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT], tiles: [gl.RG32UI, gl.RG_INTEGER, gl.UNSIGNED_INT],
     };
     TEXTURES.forEach((name, unit) => {
@@ -33,6 +35,7 @@ export class Splatter {
     });
     gl.bindVertexArray(gl.createVertexArray());
     this.setSky({ width: 1, height: 1, radiance: new Float32Array(3) });
+    this.setGround({ ground: { width: 2, values: new Float32Array(16) }, sun0: NO_SUN, sun1: NO_SUN });
   }
 
   /** Whether the context was lost, as after a driver's reset. */
@@ -43,6 +46,11 @@ export class Splatter {
     const texels = new Float32Array(4 * width * height);
     for (let k = 0; k < width * height; k++) texels.set(radiance.subarray(3 * k, 3 * k + 3), 4 * k);
     this.upload("sky", width, texels);
+  }
+
+  /** Set maps of the shadow on the ground (groundShadow). */
+  setGround(maps) {
+    for (const [name, { width, values }] of Object.entries(maps)) this.upload(name, width, values);
   }
 
   /** Render the result of `project` for the camera of `view` (fineView) to `canvas`, with the uniforms `look`. */
@@ -60,7 +68,7 @@ export class Splatter {
 
   upload(name, width, values) {
     const { gl } = this, [internal, format, type] = this.formats[name];
-    const height = values.length / width / { [gl.RGBA]: 4, [gl.RG_INTEGER]: 2, [gl.RED_INTEGER]: 1 }[format];
+    const height = values.length / width / { [gl.RGBA]: 4, [gl.RG_INTEGER]: 2, [gl.RED_INTEGER]: 1, [gl.RED]: 1 }[format];
     if (height > this.largest) throw new Error("more Gaussians in the frame than this browser's textures hold");
     gl.activeTexture(gl.TEXTURE0 + TEXTURES.indexOf(name));
     gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, format, type, values);

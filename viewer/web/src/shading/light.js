@@ -136,6 +136,16 @@ export function brightestDirection(light) {
   return mean.map((x) => x / length);
 }
 
+/** Radiance [3] towards `direction` in the light's frame, bilinear between texels (rnd_runtime/core/latlong.py). */
+export function sampleLight({ height, width, radiance }, [x, y, z]) {
+  const column = (0.5 + Math.atan2(z, x) / (2 * Math.PI)) * width - 0.5;
+  const row = Math.min(Math.max(Math.atan2(Math.hypot(x, z), y) / Math.PI * height - 0.5, 0), height - 1);
+  const left = Math.floor(column), top = Math.floor(row), s = column - left, t = row - top;
+  const texel = (i, j, c) => radiance[3 * (Math.min(i, height - 1) * width + (j + width) % width) + c];
+  const across = (i, c) => (1 - s) * texel(i, left, c) + s * texel(i, left + 1, c);
+  return [0, 1, 2].map((c) => (1 - t) * across(top, c) + t * across(top + 1, c));
+}
+
 /** Unit directions [H·W·3] of all texels' centres in the light's frame. */
 export function texelDirections(height, width) {
   const directions = new Float64Array(3 * height * width);

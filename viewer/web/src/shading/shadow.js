@@ -14,7 +14,7 @@ export function addSuns(suns, gaussians, count, eye, covarianceScale, radiance) 
 }
 
 /** Disc radius [count] m of each Gaussian in a depth map; `covarianceScale` scales covariances. */
-function discRadii({ covariances, opacities }, count, covarianceScale) {
+export function discRadii({ covariances, opacities }, count, covarianceScale) {
   const radii = new Float32Array(count);
   for (let i = 0; i < count; i++) {
     const trace = covarianceScale * (covariances[6 * i] + covariances[6 * i + 3] + covariances[6 * i + 5]);
