@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import load_motion
+from rnd_runtime.motion.readers.bvh import read_bvh
 from support.known_motion import DOUBLE, FRAMES, MATRICES, METRES, PELVIS, SKELETON, TEXT, Z_UP
 from support.known_skeletons import NAMINGS, assert_same_poses, write_bvh
 
@@ -33,16 +34,64 @@ def test_hips_below_a_root_of_their_own_go_where_they_are_sent(tmp_path):
     assert_allclose(ours.rotations, plain.rotations, atol=TEXT)
 
 
+def test_hips_beside_other_joints_of_a_root_go_where_they_are_sent(tmp_path):
+    """As Unreal's, beside targets for hands and feet; a still root, and two joints of one name."""
+    file = write_bvh(tmp_path / "a.bvh", NAMINGS["unreal"], spread={})
+    plain = load_motion(file, SKELETON)
+    head, _, frames = file.read_text().partition("MOTION\n")
+    aside = "JOINT ik_foot\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n}\n"
+    above = "ROOT root\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
+    head = head.replace("ROOT", above + "JOINT", 1) + 2 * aside + "}\n"
+    first, second, *lines = frames.splitlines()
+    moved = [first, second, *(f"0 0 0 {line} 0 0 0 0 0 0" for line in lines)]
+    file.write_text(head + "MOTION\n" + "\n".join(moved) + "\n")
+    motion = load_motion(file, SKELETON)
+    assert np.ptp(motion.translations, axis=0).max() > 0.1 and motion.notes == plain.notes
+    assert_allclose(motion.translations, plain.translations, atol=TEXT)
+    assert_allclose(motion.rotations, plain.rotations, atol=TEXT)
+
+
+@pytest.mark.parametrize("added", [False, True])
+def test_joints_are_where_their_own_positions_put_them(tmp_path, added):
+    """Spine and thigh have positions too, which grow by a tenth or say how far they are from their offsets."""
+    file = write_bvh(tmp_path / "a.bvh", NAMINGS["mixamo"], spread={})
+    still = read_bvh(file)
+    text, channels, joints = file.read_text(), [], []
+    for line in text.partition("MOTION\n")[0].splitlines():
+        words = line.split()
+        if words[0] in ("ROOT", "JOINT"):
+            joints.append(" ".join(words[1:]))
+        channels += [(joints[-1], name) for name in words[2:] if words[0] == "CHANNELS"]
+    thigh = "mixamorig:LeftUpLeg"
+    at = [name for name, _ in channels].index(thigh)
+    head, _, frames = text.partition("MOTION\n")
+    before, mark, after = head.partition(f"JOINT {thigh}\n")
+    after = after.replace("CHANNELS 3 ", "CHANNELS 6 Xposition Yposition Zposition ", 1)
+    first, second, *lines = frames.splitlines()
+    joint = still.names.index(thigh)
+    places = still.offsets[joint] * (1 + np.linspace(-0.1, 0.1, FRAMES)[:, None])
+    for number, line in enumerate(lines):
+        words = line.split()
+        words[at:at] = [f"{value:.8f}" for value in places[number] - added * still.offsets[joint]]
+        lines[number] = " ".join(words)
+    file.write_text(before + mark + after + "MOTION\n" + "\n".join([first, second, *lines]) + "\n")
+    tree = read_bvh(file)
+    turns = tree.global_rotations()
+    positions, parent = tree.positions(turns), tree.parents[joint]
+    expected = positions[:, parent] + np.einsum("fij,fj->fi", turns[:, parent], places)
+    assert_allclose(positions[:, joint], expected, atol=TEXT)
+
+
 @pytest.mark.parametrize(
     ("frames", "time"), [("Frames:12", "Frame Time:0.0083333"), ("Frames : 12", "Frame Time\t:\t.0083333")]
 )
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-be"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-be", "utf-16-le"])
 def test_spaces_and_encodings_make_no_difference(tmp_path, frames, time, encoding):
     file = write_bvh(tmp_path / "a.bvh", NAMINGS["mixamo"])
     plain, text = load_motion(file, SKELETON), file.read_text()
     assert "Frames: 12\nFrame Time: 0.0083333" in text
     text = text.replace("Frames: 12\nFrame Time: 0.0083333", f"{frames}\n{time}").replace("\n", "\r\n")
-    file.write_bytes((b"\xfe\xff" if encoding == "utf-16-be" else b"") + text.encode(encoding))
+    file.write_bytes(text.encode(encoding))
     motion = load_motion(file, SKELETON)
     assert motion.fps == plain.fps
     assert_allclose(motion.rotations, plain.rotations, atol=DOUBLE)
@@ -60,6 +109,8 @@ BROKEN_BVH = {
     "offset": "HIERARCHY ROOT a { OFFSET 0 nan 0 CHANNELS 0 } MOTION Frames: 1 Frame Time: 0.1",
     "short": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation } MOTION Frames: 3 Frame Time: 0.03 1 2",
     "time": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation } MOTION Frames: 1 Frame Time: 0 1",
+    "no frames": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation } MOTION Frames: 0 Frame Time: 0.1",
+    "two roots": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 0 } ROOT b { OFFSET 0 0 0 CHANNELS 0 } MOTION Frames: 1",
     "channel": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Wrotation } MOTION Frames: 1 Frame Time: 0.1 1",
     "no channels": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 0 } MOTION Frames: 1000000000000 Frame Time: 0.1",
     "far offset": "HIERARCHY ROOT a { OFFSET 0 1e200 0 CHANNELS 1 Xrotation } MOTION Frames: 1 Frame Time: 0.1 1",

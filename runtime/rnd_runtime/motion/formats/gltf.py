@@ -14,7 +14,7 @@ from rnd_runtime.core.budget import Budget
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.rotations import matrix_to_quaternion, quaternion_to_matrix
-from rnd_runtime.motion.readers.tree import Floats, MocapTree
+from rnd_runtime.motion.readers.tree import Floats, MocapTree, unique_names
 
 from .rigs import world_tree
 
@@ -153,7 +153,7 @@ def _read(document: _Document) -> tuple[MocapTree, dict[str, int] | None]:
     order, positions, rotations = _world(nodes, parents, tracks, times)
     joints = _kept(document, nodes, parents, {node for node, _ in tracks})
     kept = [node for node in order if node in joints]
-    names = _unique(["scene", *(str(nodes[node].get("name") or f"node {node}") for node in kept)])
+    names = unique_names(["scene", *(str(nodes[node].get("name") or f"node {node}") for node in kept)])
     above = [-1, *(1 + kept.index(parents[node]) if parents[node] in joints else 0 for node in kept)]
     still = np.zeros((len(times), 1, 3)), np.tile(np.eye(3), (len(times), 1, 1, 1))
     notes: tuple[str, ...] = ()
@@ -326,13 +326,3 @@ def _humanoid(document: dict[str, Any]) -> dict[str, int] | None:
         if bones:
             return {_HUMANOID[bone]: int(value["node"]) for bone, value in bones.items() if bone in _HUMANOID}
     return None
-
-
-def _unique(names: list[str]) -> list[str]:
-    """``names`` with a number added to those that occur before."""
-    seen: dict[str, int] = {}
-    result = []
-    for name in names:
-        seen[name] = seen.get(name, 0) + 1
-        result.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
-    return result

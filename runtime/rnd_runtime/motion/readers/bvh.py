@@ -11,9 +11,11 @@ import numpy as np
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 
-from .tree import Floats, MocapTree, about_axis, check_size
+from .tree import Floats, MocapTree, about_axis, check_size, unique_names
 
 _ROUNDED_FPS = 2e-4  # relative distance to a whole number: more than of 1 / 0.0083333, less than of 29.97
+
+_STILL = 1e-3  # of the longest bone: positions of joints below the root that differ less are constant
 
 
 @dataclass
@@ -57,32 +59,27 @@ def _read(words: Iterator[str]) -> MocapTree:
             else:
                 positions[:, number, axis] = values[:, column]
             column += 1
-    root_positions, trunk = _root_path(joints, rotations, positions)
-    moving = [
-        joint.name
-        for number, joint in enumerate(joints)
-        if number not in trunk and any(name.endswith("position") for name in joint.channels)
-    ]
-    notes = (f"positions of joints but the root are left out: {', '.join(moving[:3])}, …",) if moving else ()
-    names, parents = tuple(joint.name for joint in joints), tuple(joint.parent for joint in joints)
+    names = unique_names([joint.name for joint in joints])
+    parents = tuple(joint.parent for joint in joints)
     offsets = np.array([joint.offset for joint in joints])
     ends = {number: joint.end for number, joint in enumerate(joints) if joint.end is not None}
-    return MocapTree(names, parents, offsets, rotations, root_positions, _rounded(1 / seconds), notes, ends)
+    moves = _moves(offsets, positions)
+    return MocapTree(names, parents, offsets, rotations, positions[:, 0], _rounded(1 / seconds), (), ends, moves)
 
 
-def _root_path(joints: list[_Joint], rotations: Floats, positions: Floats) -> tuple[Floats, list[int]]:
-    """The root's path [F, 3] plus that of only children below it, and the indices of these joints.
+def _moves(offsets: Floats, positions: Floats) -> dict[int, Floats]:
+    """``positions`` [F, 3] of joints below the root that move in their parent's frame, as hips below a fixed root.
 
-    Many tools animate the hips below a fixed root. ``positions`` [F, J, 3] are in the parent's frame and replace the
-    offset.
+    They replace the offset, or add to it where they are about zero. Channels that stay constant say nothing.
     """
-    joint, trunk, path, global_rotation = 0, [0], positions[:, 0], rotations[:, 0]
-    while len(children := [k for k, child in enumerate(joints) if child.parent == joint]) == 1:
-        (joint,) = children
-        trunk.append(joint)
-        path = path + np.einsum("fij,fj->fi", global_rotation, positions[:, joint] - joints[joint].offset)
-        global_rotation = global_rotation @ rotations[:, joint]
-    return path, trunk
+    still = _STILL * np.linalg.norm(offsets, axis=-1).max()
+    moves = {}
+    for joint in np.flatnonzero(np.ptp(positions, axis=0).max(-1) > still):
+        usual = np.median(positions[:, joint], axis=0)
+        added = np.linalg.norm(usual) < np.linalg.norm(usual - offsets[joint])
+        if joint:
+            moves[int(joint)] = positions[:, joint] + added * offsets[joint]
+    return moves
 
 
 def _hierarchy(words: Iterator[str]) -> list[_Joint]:
@@ -96,6 +93,8 @@ def _hierarchy(words: Iterator[str]) -> list[_Joint]:
             name = next(words)
             while (more := next(words)) != "{":  # names with spaces
                 name += f" {more}"
+            if joints and not open_joints:
+                raise InputError("BVH hierarchy", expected="one ROOT", got=f"{joints[0].name} and {name}")
             joints.append(_Joint(name, open_joints[-1] if open_joints else -1))
             open_joints.append(len(joints) - 1)
         elif word == "End" and open_joints:
@@ -130,7 +129,9 @@ def _motion(words: Iterator[str], channels: int) -> tuple[int, float, Floats]:
     values = np.array([float(word) for word in words])
     if channels == 0:
         raise InputError("channels", expected="at least one", got="none")
-    if frames < 1 or values.size != frames * channels:
+    if frames < 1:
+        raise InputError("Frames", expected="at least one", got=frames)
+    if values.size != frames * channels:
         raise InputError("BVH motion", expected=f"{frames} frames of {channels} numbers", got=values.size)
     if not 1e-4 <= seconds <= 10:
         raise InputError("Frame Time", expected="seconds, 0.0001 to 10", got=seconds)
@@ -154,9 +155,11 @@ def _after(label: str, words: Iterator[str]) -> str:
 
 
 def _text(content: bytes) -> str:
-    """UTF-8, or UTF-16 by its mark, as some programs of Windows save a text."""
+    """UTF-8, or UTF-16 by its mark or zeros, as some programs of Windows save a text."""
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return content.decode("utf-16", errors="replace")
+    if b"\0" in content[:2]:
+        return content.decode("utf-16-be" if content[0] == 0 else "utf-16-le", errors="replace")
     return content.decode("utf-8-sig", errors="replace")
 
 

@@ -29,6 +29,7 @@ class MocapTree:
         fps: frames per second.
         notes: assumptions and omissions.
         ends: offsets [3] of end sites, by the joint above.
+        moves: positions [F, 3] in the parent's frame, by joint, of those that move in it.
 
     Raises:
         InputError: names or parents are not those of one tree.
@@ -42,6 +43,7 @@ class MocapTree:
     fps: float
     notes: tuple[str, ...] = ()
     ends: Mapping[int, Floats] = field(default_factory=dict)
+    moves: Mapping[int, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         apart = [joint for joint, parent in enumerate(self.parents) if joint and not 0 <= parent < joint]
@@ -67,8 +69,19 @@ class MocapTree:
         positions = np.empty(global_rotations.shape[:-1])
         positions[:, 0] = self.root_positions
         for joint, parent in enumerate(self.parents[1:], 1):
-            positions[:, joint] = positions[:, parent] + global_rotations[:, parent] @ self.offsets[joint]
+            offset = np.broadcast_to(self.moves.get(joint, self.offsets[joint]), positions[:, 0].shape)
+            positions[:, joint] = positions[:, parent] + np.einsum("fij,fj->fi", global_rotations[:, parent], offset)
         return positions
+
+
+def unique_names(names: Sequence[str]) -> tuple[str, ...]:
+    """``names`` with a number added to those that occur before."""
+    seen: dict[str, int] = {}
+    result = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        result.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
+    return tuple(result)
 
 
 def check_size(what: str, numbers: Sequence[float], frame: int | None = None) -> None:
