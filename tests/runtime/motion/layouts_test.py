@@ -74,6 +74,7 @@ def test_of_whams_repeated_frames_the_first_counts_as_for_rnd_data_import(tmp_pa
     motion = load_motion(write_pickle(file, {3: track}), SKELETON)
     assert_allclose(motion.rotations[3:], MATRICES[3:], atol=SINGLE)
     assert motion.frame_count == FRAMES and not np.allclose(motion.rotations[2], MATRICES[2], atol=0.01)
+    assert "frame numbers are out of order: sorted; of repeated ones the first counts" in motion.notes
     track["frame_ids"] = track["frame_ids"][1:]
     with pytest.raises(InputError, match=rf"wham_output.pkl: poses of a track: .* got {FRAMES + 1} and {FRAMES}"):
         load_motion(write_pickle(file, {3: track}), SKELETON)

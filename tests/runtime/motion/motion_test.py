@@ -287,15 +287,34 @@ POSES = _flat(_axis_angles(24))
 
 
 @pytest.mark.parametrize(
-    ("step", "height", "noted"),
-    [(0.1, 1.0, False), (0.3, 1.0, False), (100.0, 1.0, True), (0.001, 950.0, True), (0.001, 2.0, False)],
+    ("step", "height", "unit"),
+    [
+        *((0.1, 1.0, ""), (0.3, 1.0, ""), (0.001, 2.0, "")),
+        *((100.0, 1.0, "millimetres"), (0.001, 950.0, "millimetres"), (4.0, 1.0, "centimetres")),
+        (0.001, 95.0, "centimetres"),
+    ],
 )
-def test_millimetres_are_noted(tmp_path, step, height, noted):
-    """Steps in m (or mm) at 30 frames per second: a sprinter's is 0.4 m."""
+def test_other_units_than_metres_are_noted(tmp_path, step, height, unit):
+    """Steps in m (or cm, or mm) at 30 frames per second: a sprinter's is 0.4 m."""
     trans = np.stack([np.arange(FRAMES) * step, np.full(FRAMES, height), np.zeros(FRAMES)], 1)
     file = _save(tmp_path / "a.npz", poses=POSES, trans=trans, mocap_framerate=30.0)
     notes = load_motion(file, _skeleton()).notes
-    assert any("millimetres" in note for note in notes) == noted
+    assert [note.split()[-1] for note in notes if "look like" in note] == [unit] * bool(unit)
+
+
+@pytest.mark.parametrize("name", ["times", "timestamps"])
+def test_times_give_the_frame_rate_and_are_told_where_uneven(tmp_path, name):
+    def load(times: np.ndarray, **members: object) -> Motion:
+        file = _save(tmp_path / "a.npz", poses=POSES, trans=TRANS, **{name: times}, **members)
+        return load_motion(file, _skeleton())
+
+    even = load(3 + np.arange(FRAMES) / 24)
+    assert even.fps == 24 and not any("frame rate" in note or "uneven" in note for note in even.notes)
+    assert load(np.arange(FRAMES) / 24, fps=25.0).fps == 25
+    gap = load(np.arange(FRAMES) / 24 + 2 * (np.arange(FRAMES) > 2), fps=24.0)
+    assert f"{name} are uneven: the frames are played one after the other" in gap.notes
+    frames = load(np.arange(FRAMES))  # no seconds
+    assert frames.fps == 60 and any("frame rate" in note for note in frames.notes)
 
 
 def test_times_that_increase_and_names_of_frames_are_no_reason_to_refuse(tmp_path):

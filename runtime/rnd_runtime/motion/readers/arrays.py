@@ -20,8 +20,11 @@ _AMASS_MEMBERS = ("surface_model_type", "mocap_frame_rate", "mocap_framerate", "
 _MAX_ANGLE = 100.0  # rad, beyond what fits contain
 _MANY_BEYOND_A_TURN = 0.2  # share of rotations; half of all in degrees, 1/22 with a spinning root
 _MAX_DISTANCE = 1000.0  # m; more suggests millimetres
-_MAX_HEIGHT, _MAX_SPEED = 100.0, 20.0  # m, m/s, of the median frame: a sprinter has 12 m/s
-_ORDERS = ("times", "timestamps", "frame_ids", "frame_id")
+_MAX_HEIGHT, _MAX_SPEED = 30.0, 20.0  # m, m/s, of the median frame: a sprinter has 12 m/s
+_TIMES = ("times", "timestamps")
+_ORDERS = (*_TIMES, "frame_ids", "frame_id")
+_FPS_OF_TIMES = (5.0, 1000.0)  # else they are no seconds
+_UNEVEN = 0.5  # of a frame, largest difference of steps in time
 _DEFAULT_FPS = 60.0
 _ORTHOGONAL = 0.02  # largest element of R Rᵀ − 1
 FPS_LIMITS = (1e-3, 1e4)
@@ -77,7 +80,7 @@ def read_arrays(
     ======================================================  ==========================================  ====
 
     ``poses`` may be rotation matrices (F,J,3,3). ``up_axis`` ("y" or "z") in the file overrides the column *up*.
-    Frame rate: ``mocap_framerate``, ``mocap_frame_rate`` or ``fps``; without one, 60 is assumed and noted.
+    Frame rate: ``mocap_framerate``, ``mocap_frame_rate`` or ``fps``, else of ``times`` in seconds, else 60 with a note.
 
     Args:
         joint_names: the joints of the columns, for a file without names (a capture's motion).
@@ -114,15 +117,16 @@ def read_arrays(
     check_translations(translations, members.path)
     if "betas" in members.names:
         remarks.append("the file's betas are ignored: the avatar keeps its own shape")
-    fps = frame_rate(members)
+    _check_order(members, len(rotations))
+    by_times = _rate_of_times(members, len(rotations), remarks)
+    fps = frame_rate(members) or by_times
     if fps is None:
         remarks.append(f"no frame rate in the file: {_DEFAULT_FPS:g} frames per second assumed")
         fps = _DEFAULT_FPS
     stated = _up_axis(members)
     up = stated or up or ("z" if amass or easymocap else "y")
-    _check_order(members, len(rotations))
-    if _look_like_millimetres(translations, fps, up):
-        remarks.append("trans is higher or faster than a person in metres: these look like millimetres")
+    if unit := _likely_unit(translations, fps, up):
+        remarks.append(f"trans is higher or faster than a person in metres: these look like {unit}")
     if rest_root is None and (amass or easymocap):
         rest_root = smpl_root
     return MotionRecord(rotations, translations, rest_root, names, fps, up, stated is not None, tuple(remarks))
@@ -259,17 +263,19 @@ def check_translations(translations: Floats, path: str | Path, first: int = 0) -
         )
 
 
+def _number_of_each(archive: Members, member: str, frames: int) -> Floats:
+    """[F] of ``member``; [0] where it is missing or no number of each frame, as names of images."""
+    try:
+        values = archive.numbers(member) if member in archive.names else np.empty(0)
+    except InputError:
+        return np.empty(0)
+    return values.reshape(-1) if values.size == frames else np.empty(0)
+
+
 def _check_order(archive: Members, frames: int) -> None:
     """Raise ``InputError`` where the file's times or frame numbers do not increase from frame to frame."""
     for member in _ORDERS:
-        if member not in archive.names:
-            continue
-        try:
-            values = archive.numbers(member)
-        except InputError:  # names of images, say
-            continue
-        if values.shape != (frames,):
-            continue
+        values = _number_of_each(archive, member, frames)
         back = np.flatnonzero(np.diff(values) <= 0)
         if len(back):
             before, after = values[back[0] : back[0] + 2]
@@ -283,10 +289,25 @@ def _check_order(archive: Members, frames: int) -> None:
             )
 
 
-def _look_like_millimetres(translations: Floats, fps: float, up: str) -> bool:
+def _likely_unit(translations: Floats, fps: float, up: str) -> str:
+    """The unit of ``translations`` that are not a person's in metres; "" of those that may be."""
     heights = np.abs(translations[:, "xyz".index(up)])
     speeds = np.linalg.norm(np.diff(translations, axis=0), axis=1) * fps
-    return bool(np.median(heights) > _MAX_HEIGHT or (len(speeds) > 0 and np.median(speeds) > _MAX_SPEED))
+    beyond = max(float(np.median(heights)) / _MAX_HEIGHT, float(np.median(speeds)) / _MAX_SPEED if len(speeds) else 0)
+    return "" if beyond <= 1 else "centimetres" if beyond < 10 else "millimetres"
+
+
+def _rate_of_times(archive: Members, frames: int, notes: list[str]) -> float | None:
+    """Frames per second of even times in seconds, after ``_check_order``; None without, with a note on uneven ones."""
+    low, high = _FPS_OF_TIMES
+    for member in _TIMES:
+        steps = np.diff(_number_of_each(archive, member, frames))
+        if not len(steps) or not low * (step := float(np.median(steps))) <= 1 <= high * step:
+            continue
+        if np.abs(steps - step).max() > _UNEVEN * step:
+            notes.append(f"{member} are uneven: the frames are played one after the other")
+        return round(1 / step, 3)
+    return None
 
 
 def frame_rate(archive: Members) -> float | None:

@@ -16,7 +16,7 @@ from rnd_runtime.core.rotations import axis_angle_to_matrix, matrix_to_axis_angl
 from rnd_runtime.motion.smpl import SMPL_REST_ROOT, SMPLX_REST_ROOT
 
 from .arrays import check_rotations
-from .video_fits import in_order
+from .video_fits import in_order, order_notes
 
 Floats = NDArray[np.float64]
 
@@ -75,9 +75,10 @@ def wham(people: Mapping[Any, Mapping[str, Any]], path: str | Path) -> Track:
     placed = names[1] in person
     poses = np.asarray(person[names[0]], np.float64)
     trans = person[names[1]] if placed else np.zeros((len(poses), 3))
-    frames, (poses, trans) = in_order(person.get("frame_ids", np.arange(len(poses))), poses, trans)
+    numbers = person.get("frame_ids", np.arange(len(poses)))
+    frames, (poses, trans) = in_order(numbers, poses, trans)
     poses, trans, filled = without_gaps(frames, poses.reshape(len(poses), -1), trans, path)
-    notes += filled
+    notes += order_notes(numbers) + filled
     if world:
         return video_track({"poses": poses, "trans": trans}, path, SMPL_REST_ROOT, notes)
     poses, trans, level = upright(poses, trans)
@@ -91,11 +92,12 @@ def tram(content: Mapping[str, Any], path: str | Path) -> Track:
     matrices = np.asarray(content["pred_rotmat"], np.float64)
     trans = np.asarray(content["pred_trans"], np.float64).reshape(-1, 3)
     poses = matrix_to_axis_angle(check_rotations(matrices, "pred_rotmat", path)).reshape(len(matrices), -1)
-    frames, (poses, trans) = in_order(content.get("frame", np.arange(len(poses))), poses, trans)
+    numbers = content.get("frame", np.arange(len(poses)))
+    frames, (poses, trans) = in_order(numbers, poses, trans)
     poses, trans, filled = without_gaps(frames, poses, trans, path)
     poses, trans, level = upright(poses, trans)
     arrays = {"poses": poses, "trans": trans, "up_axis": "y"}
-    return video_track(arrays, path, SMPL_REST_ROOT, (*filled, *level))
+    return video_track(arrays, path, SMPL_REST_ROOT, (*order_notes(numbers), *filled, *level))
 
 
 def prompthmr(content: Mapping[Any, Any], path: str | Path) -> Track:
@@ -105,9 +107,11 @@ def prompthmr(content: Mapping[Any, Any], path: str | Path) -> Track:
     person = people[longest]
     world = person["smplx_world"]
     poses = np.asarray(world["pose"], np.float64)
-    frames, (poses, trans) = in_order(person.get("frames", np.arange(len(poses))), poses, world["trans"])
+    numbers = person.get("frames", np.arange(len(poses)))
+    frames, (poses, trans) = in_order(numbers, poses, world["trans"])
     poses, trans, filled = without_gaps(frames, poses.reshape(len(poses), -1), trans, path)
-    return video_track({"poses": poses, "trans": trans}, path, SMPLX_REST_ROOT, (*notes, *filled))
+    notes += order_notes(numbers) + filled
+    return video_track({"poses": poses, "trans": trans}, path, SMPLX_REST_ROOT, notes)
 
 
 def slahmr(members: Members, path: str | Path) -> Track:

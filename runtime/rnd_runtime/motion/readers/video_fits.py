@@ -156,6 +156,12 @@ def in_order(frames: ArrayLike, *values: ArrayLike) -> tuple[NDArray[np.int64], 
     return ascending, [array[first] for array in arrays]
 
 
+def order_notes(frames: ArrayLike) -> tuple[str, ...]:
+    """A note where a track's frame numbers are not ``in_order``."""
+    back = np.flatnonzero(np.diff(np.asarray(frames, np.int64).reshape(-1)) <= 0)
+    return ("frame numbers are out of order: sorted; of repeated ones the first counts",) if len(back) else ()
+
+
 def with_root(poses: Floats) -> Floats:
     """Poses [F, 3J] with a zero root prepended where it is missing (63 and 69 columns)."""
     if poses.shape[1] in (63, 69):
