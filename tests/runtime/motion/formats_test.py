@@ -23,7 +23,7 @@ from support.foreign_motion import (
     write_sam3d,
     write_somax,
 )
-from support.known_motion import SKELETON, write_pickle
+from support.known_motion import SKELETON, write_npz, write_pickle
 
 LIMBS = ("shoulder", "elbow", "hip", "knee")
 POINTS, ROLLS = 2.0, 6.0  # degrees: of limbs' directions, of their rotations
@@ -123,6 +123,11 @@ POSITIONS = {
     ),
     "HumanML3D": lambda f: _save(f, humanml_numbers(JOINTS[:, :22])),
     "HumanML3D, several": lambda f: _save(f, np.stack([humanml_numbers(JOINTS[:, :22])] * 3)),
+    "time last": lambda f: _save(f, JOINTS[:, :22].transpose(1, 2, 0)),
+    "several, time last": lambda f: _save(f, np.stack([JOINTS.transpose(1, 2, 0)] * 2)),
+    ".npz": lambda f: write_npz(f / "a.npz", joints=JOINTS[:, :22]),
+    ".npz of HumanML3D": lambda f: write_npz(f / "a.npz", motion=humanml_numbers(JOINTS[:, :22])),
+    "dict": lambda f: write_pickle(f / "a.pkl", {"joints3d": JOINTS, "text": "walks"}),
 }
 
 
@@ -137,10 +142,38 @@ def test_poses_are_fitted_to_positions(tmp_path, name):
     assert motion.fps == 20
     notes = " ".join(motion.notes)
     assert "without rotations" in notes and "20 frames per second assumed" in notes
-    assert ("the first is taken" in notes) == (name in ("MDM", "HumanML3D, several"))
+    assert ("the first is taken" in notes) == (name in ("MDM", "HumanML3D, several", "several, time last"))
     assert ("millimetres" in notes) == (name == "in millimetres")
     assert _worst_direction(motion) < POSITIONS_ALONE
     assert _path_off(motion) < 0.03
+
+
+def test_named_positions_have_their_frame_rate(tmp_path):
+    motion = load_motion(write_npz(tmp_path / "a.npz", joints=JOINTS, fps=25.0), SKELETON)
+    assert motion.fps == 25 and not any("frame rate" in note for note in motion.notes)
+
+
+def test_of_several_kimodo_motions_the_first_is_taken(tmp_path):
+    plain = load_motion(file := write_kimodo(tmp_path), SKELETON)
+    with np.load(file) as members:
+        both = {name: np.stack([array, array[::-1]]) for name, array in members.items() if array.ndim > 1}
+    motion = load_motion(write_npz(tmp_path / "b.npz", **both), SKELETON)
+    assert_allclose(motion.rotations, plain.rotations, atol=1e-9)
+    assert "2 motions in the file: the first is taken" in motion.notes
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ([[{"pred_cam_t": JOINTS[0, 0], "shape_params": 3}]], "a list of a list of pred_cam_t, shape_params"),
+        ({"a.jpg": {"pred_cam_t": JOINTS[0, 0]}, "b.jpg": {}}, "a.jpg, b.jpg: pred_cam_t"),
+        ({}, "no keys"),
+    ],
+    ids=["list", "dict", "empty"],
+)
+def test_what_is_no_motion_is_described(tmp_path, content, said):
+    with pytest.raises(InputError, match=rf"a\.pkl: motion: expected a dict of arrays, got {said}$"):
+        load_motion(write_pickle(tmp_path / "a.pkl", content), SKELETON)
 
 
 def test_humanml3ds_numbers_are_positions():

@@ -14,7 +14,7 @@ from rnd_runtime.core.files import is_folder
 from rnd_runtime.core.npz import Members, Npz
 from rnd_runtime.motion.readers.arrays import MotionRecord, read_arrays
 from rnd_runtime.motion.readers.asf_amc import read_amc
-from rnd_runtime.motion.readers.pickles import track_of, track_of_folder
+from rnd_runtime.motion.readers.pickles import described, track_of, track_of_folder
 from rnd_runtime.motion.readers.tracks import Track, is_slahmr, slahmr
 from rnd_runtime.motion.readers.tree import MocapTree
 from rnd_runtime.motion.readers.video_fits import easymocap_files
@@ -24,7 +24,7 @@ from .gltf import read_gltf
 from .rigs import MHR127, Rig
 from .sam3d import is_sam3d, is_sam3d_folder, read_folder, read_sam3d, sam3d_files
 from .soma import gemx, is_gemx, is_kimodo, is_somax, kimodo, somax
-from .vectors import JointPaths, is_mdm_result, mdm_result, read_vector
+from .vectors import JointPaths, is_mdm_result, is_named_vector, mdm_result, named_vector, read_vector
 
 _PICKLES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
 _BLENDER = "import it into Blender and export the armature as .bvh or .glb"
@@ -106,23 +106,27 @@ def _folder(path: Path) -> MotionRecord | Recording:
 
 def _pickle(content: Any, path: Path, joint_names: tuple[str, ...] | None) -> MotionRecord | Recording | JointPaths:
     if isinstance(content, np.ndarray):
-        vector = read_vector(content, path)
-        return vector if isinstance(vector, JointPaths) else _record(vector, joint_names)
+        return _vector(read_vector(content, path), joint_names)
     if is_sam3d(content):
         return _sam3d(content, path)
     if not isinstance(content, Mapping) or not content:
-        kind = "no keys" if isinstance(content, Mapping) else f"a {type(content).__name__}"
-        raise InputError("motion", expected="a dict of arrays", got=kind, file=path)
+        raise InputError("motion", expected="a dict of arrays", got=described(content), file=path)
     if is_gemx(content):
         return _rigged(*gemx(content, path))
     if is_mdm_result(content):
         return mdm_result(content, path)
     if is_kimodo(members := Members({str(name): value for name, value in content.items()}, path)):
         return _rigged(*kimodo(members))
+    if is_named_vector(members):
+        return _vector(named_vector(members), joint_names)
     return _record(track_of(content, path), joint_names)
 
 
-def _archive(archive: Npz, joint_names: tuple[str, ...] | None) -> MotionRecord | Recording:
+def _vector(vector: Track | JointPaths, joint_names: tuple[str, ...] | None) -> MotionRecord | JointPaths:
+    return vector if isinstance(vector, JointPaths) else _record(vector, joint_names)
+
+
+def _archive(archive: Npz, joint_names: tuple[str, ...] | None) -> MotionRecord | Recording | JointPaths:
     if is_kimodo(archive):
         return _rigged(*kimodo(archive))
     if is_somax(archive):
@@ -132,6 +136,8 @@ def _archive(archive: Npz, joint_names: tuple[str, ...] | None) -> MotionRecord 
         return _sam3d({name: archive.numbers(name) for name in names if name in archive.names}, archive.path)
     if is_slahmr(archive):
         return _record(slahmr(archive, archive.path), joint_names)
+    if is_named_vector(archive):
+        return _vector(named_vector(archive), joint_names)
     return read_arrays(archive, joint_names)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from rnd_runtime.motion.readers.arrays import check_rotations, frame_rate
 from rnd_runtime.motion.readers.tree import Floats, MocapTree
 
 from .rigs import SOMA30, SOMA77, Rig, world_tree
+from .vectors import one_of
 
 _FPS = 30.0
 _NOTE = f"no frame rate in the file: {_FPS:g} frames per second assumed, as SOMA's programs have"
@@ -41,7 +43,7 @@ _T_POSE = {
 
 def is_kimodo(members: Members) -> bool:
     """Whether ``members`` are Kimodo's."""
-    return {"local_rot_mats", "root_positions"} <= set(members.names)
+    return "local_rot_mats" in members.names
 
 
 def is_somax(members: Members) -> bool:
@@ -57,22 +59,24 @@ def is_gemx(content: Mapping[Any, Any]) -> bool:
 def kimodo(members: Members) -> tuple[MocapTree, Rig]:
     """``local_rot_mats`` [F, 77 | 30, 3, 3] relative to the T-pose, ``root_positions`` [F, 3]; Y up.
 
-    ``posed_joints`` [F, J, 3] give the bones; without them they are those of SOMA's neutral body.
+    ``posed_joints`` [F, J, 3] give the bones; without them they are those of SOMA's neutral body. Of several motions
+    [N, F, …] the first is taken.
     """
-    rotations = members.numbers("local_rot_mats")
-    if rotations.ndim == 5 and len(rotations) == 1:
-        rotations = rotations[0]
+    rotations, motions = members.numbers("local_rot_mats"), 1
+    if rotations.ndim == 5 and len(rotations):
+        rotations, motions = rotations[0], len(rotations)
     check_rotations(rotations, "local_rot_mats", members.path)
     rig = {77: SOMA77, 30: SOMA30}.get(rotations.shape[1])
     if rig is None:
         robot = " (34 are a Unitree G1's, a robot)" if rotations.shape[1] == 34 else ""
         expected = f"77 or 30 of SOMA{robot}"
         raise InputError("joints of local_rot_mats", expected=expected, got=rotations.shape[1], file=members.path)
-    path = members.numbers("root_positions").reshape(-1, 3)
+    path = members.numbers("root_positions").reshape(motions, -1, 3)[0]
     joints = None
     if "posed_joints" in members.names:
-        joints = members.numbers("posed_joints").reshape(-1, len(rig.names), 3)
-    return _tree(rig, rotations, path, members, joints), rig
+        joints = members.numbers("posed_joints").reshape(motions, -1, len(rig.names), 3)[0]
+    tree = _tree(rig, rotations, path, members, joints)
+    return replace(tree, notes=(*one_of(motions), *tree.notes)), rig
 
 
 def somax(members: Members) -> tuple[MocapTree, Rig]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.npz import Members
+from rnd_runtime.motion.readers.arrays import POSES, frame_rate
 from rnd_runtime.motion.readers.tracks import Track, video_track
 from rnd_runtime.motion.smpl import NAMES_BY_COUNT, SMPLX_REST_ROOT
 
@@ -19,6 +21,7 @@ Floats = NDArray[np.float64]
 _FPS = 20.0
 _FPS_NOTE = f"no frame rate in the file: {_FPS:g} frames per second assumed, as HumanML3D has"
 _PLACES = "joint positions without rotations: poses are fitted to them, and twists that they do not show are neutral"
+_NAMES = ("joints", "joints3d", "joint_positions", "positions", "motion", "arr_0")
 _UNITS = {1.0: "", 0.01: "centimetres", 0.001: "millimetres"}
 _THIGH = (0.2, 0.8)  # m
 _STEADY = 0.2  # largest deviation of a bone's length from its median, in most frames, of the median
@@ -54,18 +57,32 @@ def mdm_result(content: Mapping[Any, Any], path: str | Path) -> JointPaths:
     frames = motions.shape[3]
     if "lengths" in content and np.size(content["lengths"]):
         frames = int(np.clip(np.reshape(content["lengths"], -1)[0], 1, frames))
-    return _paths(motions[0, ..., :frames].transpose(2, 0, 1), path, _one_of(len(motions)))
+    return _paths(motions[0, ..., :frames].transpose(2, 0, 1), path, one_of(len(motions)))
+
+
+def is_named_vector(members: Members) -> bool:
+    """Whether ``members`` are joint positions or HumanML3D's numbers by a usual name, without poses."""
+    return members.first_of(*POSES) is None and members.first_of(*_NAMES) is not None
+
+
+def named_vector(members: Members) -> Track | JointPaths:
+    """``read_vector`` of ``members`` (``is_named_vector``), at their frame rate."""
+    name, fps = members.first_of(*_NAMES), frame_rate(members)
+    vector = read_vector(members.numbers(name or ""), members.path)
+    if fps is None or not isinstance(vector, JointPaths):
+        return vector
+    return replace(vector, fps=fps, notes=tuple(note for note in vector.notes if note != _FPS_NOTE))
 
 
 def read_vector(array: NDArray[Any], path: str | Path) -> Track | JointPaths:
     """The motion in ``array``.
 
     ================================  ==============================================================================
-    [F, 322]                          Motion-X: root 3, body 63, hands 90, jaw 3, face 150, trans 3, betas 10; SMPL-X
+    [F, 322], [N, F, 322]             Motion-X: root 3, body 63, hands 90, jaw 3, face 150, trans 3, betas 10; SMPL-X
     [F, 263], [N, F, 263]             HumanML3D (MDM, MoMask, T2M-GPT): root velocities and height, 21 joints around
                                       it, their rotations, velocities, foot contacts. Positions are recovered; the
                                       rotations are those of least twist to the same positions
-    [F, 22 | 24 | 52, 3], [N, …]      joint positions in SMPL's order
+    [F, 22 | 24 | 52, 3], [N, …]      joint positions in SMPL's order; also with time last, [22 | 24, 3, F]
     ================================  ==============================================================================
 
     Raises:
@@ -77,11 +94,13 @@ def read_vector(array: NDArray[Any], path: str | Path) -> Track | JointPaths:
     numbers = np.asarray(array, np.float64)
     if (infinite := np.argwhere(~np.isfinite(numbers))).size:
         raise InputError("motion", expected="finite numbers", got="others", file=path, frame=int(infinite[0][0]))
-    if numbers.ndim == 2 and numbers.shape[1] == 322:
-        return _motion_x(numbers, path)
     notes: tuple[str, ...] = ()
-    if (numbers.ndim == 3 and numbers.shape[2] == 263) or (numbers.ndim == 4 and numbers.shape[3] == 3):
-        numbers, notes = numbers[0], _one_of(len(numbers))
+    if numbers.ndim in (3, 4) and numbers.shape[-3] in (22, 24) and numbers.shape[-2] == 3 != numbers.shape[-1]:
+        numbers = np.moveaxis(numbers, -1, -3)
+    if (numbers.ndim == 3 and numbers.shape[2] in (263, 322)) or (numbers.ndim == 4 and numbers.shape[3] == 3):
+        numbers, notes = numbers[0], one_of(len(numbers))
+    if numbers.ndim == 2 and numbers.shape[1] == 322:
+        return _motion_x(numbers, path, notes)
     if numbers.ndim == 2 and numbers.shape[1] == 263:
         return _paths(humanml_positions(numbers), path, notes, "HumanML3D's 263 numbers")
     if numbers.ndim == 3 and numbers.shape[2] == 3 and numbers.shape[1] in (22, 24, 52):
@@ -114,14 +133,15 @@ def humanml_positions(numbers: Floats) -> Floats:
     return np.concatenate([root[:, None], others], 1)
 
 
-def _motion_x(numbers: Floats, path: str | Path) -> Track:
+def _motion_x(numbers: Floats, path: str | Path, notes: tuple[str, ...]) -> Track:
     eyes = np.zeros((len(numbers), 6))
     poses = np.concatenate([numbers[:, :66], numbers[:, 156:159], eyes, numbers[:, 66:156]], 1)
     arrays = {"poses": poses, "trans": numbers[:, 309:312], "betas": numbers[0, 312:]}
-    return video_track(arrays, path, SMPLX_REST_ROOT, ("Motion-X' expressions of the face are left out",))
+    return video_track(arrays, path, SMPLX_REST_ROOT, (*notes, "Motion-X' expressions of the face are left out"))
 
 
-def _one_of(count: int) -> tuple[str, ...]:
+def one_of(count: int) -> tuple[str, ...]:
+    """A note on a file of several motions."""
     return () if count == 1 else (f"{count} motions in the file: the first is taken",)
 
 

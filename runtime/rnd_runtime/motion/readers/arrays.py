@@ -15,6 +15,8 @@ from rnd_runtime.motion.smpl import NAMES_BY_COUNT, SMPL_REST_ROOT, SMPLX_REST_R
 
 Floats = NDArray[np.float64]
 
+POSES = ("poses", "poses_all", "pose_body", "body_pose")
+"""Members that hold rotations"""
 # Members of AMASS' SMPL-X files alone, beside the split poses
 _AMASS_MEMBERS = ("surface_model_type", "mocap_frame_rate", "mocap_framerate", "mocap_time_length")
 _MAX_ANGLE = 100.0  # rad, beyond what fits contain
@@ -134,11 +136,11 @@ def read_arrays(
 
 def _axis_angles(archive: Members, notes: list[str], joint_names: tuple[str, ...] | None) -> Floats:
     """Poses [F, J, 3] rad, the root first."""
-    member = archive.first_of("poses", "poses_all", "pose_body", "body_pose")
+    member = archive.first_of(*POSES)
     if member is None:
         raise InputError(
             "motion",
-            expected="a member called poses, poses_all, pose_body or body_pose",
+            expected=f"a member called {', '.join(POSES[:-1])} or {POSES[-1]}",
             got=", ".join(archive.names) or "an empty archive",
             file=archive.path,
         )

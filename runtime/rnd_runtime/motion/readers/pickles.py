@@ -22,6 +22,7 @@ Floats = NDArray[np.float64]
 _AIST_FPS, _MDM_FPS = 60.0, 20.0
 _PHONE_FOCAL = 1.2  # of the image's longer side: 45°. PHALP's 3° puts people 100 m away
 _SCALINGS = (1e-6, 1e6)  # AIST++'s are near 94
+_SHOWN = 8  # keys of a dict in messages
 _MIN_ROW = 1e-6  # length of a rotation's row, the second orthogonalised
 
 
@@ -74,7 +75,20 @@ def track_of(content: Mapping[Any, Any], path: str | Path) -> Track:
     people = {who: track for who, track in content.items() if isinstance(track, Mapping) and "pose" in track}
     if people:
         return wham(people, path)
+    if all(isinstance(value, Mapping | list | tuple | str) for value in content.values()):
+        raise InputError("motion", expected="a dict of arrays", got=described(content), file=path)
     return Track(Members({str(name): value for name, value in content.items()}, path), None)
+
+
+def described(content: Any, levels: int = 3) -> str:
+    """What ``content`` is, by the keys of the first dicts in it."""
+    if isinstance(content, Mapping):
+        inner = next((value for value in content.values() if isinstance(value, Mapping)), None)
+        names = ", ".join(map(str, list(content)[:_SHOWN])) or "no keys"
+        return names if inner is None or not levels else f"{names}: {described(inner, levels - 1)}"
+    if isinstance(content, list | tuple) and content and levels:
+        return f"a {type(content).__name__} of {described(content[0], levels - 1)}"
+    return f"a {type(content).__name__}"
 
 
 def _scaling(content: Mapping[Any, Any], path: str | Path) -> Any:
