@@ -24,6 +24,7 @@ from support.foreign_motion import (
     write_somax,
 )
 from support.known_motion import SKELETON, write_npz, write_pickle
+from support.known_skeletons import assert_same_poses
 
 LIMBS = ("shoulder", "elbow", "hip", "knee")
 POINTS, ROLLS = 2.0, 6.0  # degrees: of limbs' directions, of their rotations
@@ -96,6 +97,7 @@ FORMATS = {
     **{f"SAM 3D Body, {form}": (lambda f, form=form: write_sam3d(f, form), 30) for form in ("npz", "json", "flipped")},
     "GLB of Blender": (lambda f: write_glb(f, MIXAMO), 25),
     "GLB with splines": (lambda f: write_glb(f, MIXAMO, method="CUBICSPLINE", scale=1.0), 25),
+    "GLB with steps": (lambda f: write_glb(f, MIXAMO, method="STEP"), 25),
     "VRM 0": (lambda f: write_glb(f, BONES, VRM_0, "a.vrm"), 25),
     "VRM 1": (lambda f: write_glb(f, BONES, VRM_1, "a.vrm"), 25),
     "VRMA": (lambda f: write_glb(f, BONES, VRMA, "a.vrma"), 25),
@@ -273,12 +275,47 @@ def test_a_character_without_animation_names_the_way(tmp_path):
         load_motion(path, SKELETON)
 
 
-def test_of_several_animations_the_first_is_taken_and_the_others_named(tmp_path):
+def test_of_several_animations_the_first_of_a_body_is_taken_and_the_others_named(tmp_path):
+    """Not a face's, an empty one or a single joint's."""
     path = write_glb(tmp_path, MIXAMO)
+    plain = load_motion(path, SKELETON)
     document, write = _document(path)
-    document["animations"].append({"name": "jump", "channels": [], "samplers": []})
+    walk = document["animations"][0]
+    face = {"channels": [{"sampler": 0, "target": {"node": 1, "path": "weights"}}], "samplers": walk["samplers"]}
+    document["animations"].insert(0, face)
+    document["animations"].append({"name": "jump", "channels": walk["channels"][:1], "samplers": walk["samplers"]})
     write(document)
-    assert "of the file's animations walk is taken; left out: jump" in load_motion(path, SKELETON).notes
+    motion = load_motion(path, SKELETON)
+    assert "of the file's animations walk is taken; left out: one without a name, jump" in motion.notes
+    assert_allclose(motion.rotations, plain.rotations, atol=1e-9)
+
+
+def test_a_mirrored_armature_is_mirrored_back(tmp_path):
+    plain = load_motion(path := write_glb(tmp_path, MIXAMO), SKELETON)
+    document, write = _document(path)
+    document["nodes"][0]["scale"][0] *= -1
+    write(document)
+    motion = load_motion(path, SKELETON)
+    assert_same_poses(motion.rotations, plain.rotations, degrees=0.1, limbs=0.1)
+    assert "the skeleton's left is its right, as in left-handed axes: mirrored back" in motion.notes
+
+
+def test_a_separate_buffer_may_have_a_space_in_its_name(tmp_path):
+    plain = load_motion(path := write_glb(tmp_path, MIXAMO), SKELETON)
+    document, _ = _document(path)
+    (tmp_path / "a b.bin").write_bytes(path.read_bytes()[-document["buffers"][0]["byteLength"] :])
+    document["buffers"][0]["uri"] = "a%20b.bin"
+    (tmp_path / "a.gltf").write_text("\ufeff" + json.dumps(document), "utf-8")
+    assert_allclose(load_motion(tmp_path / "a.gltf", SKELETON).rotations, plain.rotations, atol=1e-9)
+
+
+def test_an_unknown_suffix_is_named(tmp_path):
+    for name, got in (("a.htr", "a .htr file"), ("a", "a nameless file")):
+        (tmp_path / name).write_text("[Header]")
+        with pytest.raises(InputError, match=rf"motion: expected a \.bvh, \.glb, \.npz or .* motion, got {got}$"):
+            load_motion(tmp_path / name, SKELETON)
+    write_npz(tmp_path / "a.npz", joints=JOINTS).rename(tmp_path / "b")
+    assert load_motion(tmp_path / "b", SKELETON).frame_count == len(JOINTS)
 
 
 def test_sam3d_follows_one_person_through_gaps(tmp_path):

@@ -7,6 +7,7 @@ import json
 import struct
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -72,7 +73,7 @@ class _Document:
         else:
             text = content
         try:
-            self.json = json.loads(text.decode("utf-8"))
+            self.json = json.loads(text.decode("utf-8-sig"))
         except (ValueError, RecursionError) as error:
             raise InputError("glTF file", expected="JSON", got=str(error)) from error
         if not isinstance(self.json, dict) or "asset" not in self.json:
@@ -113,8 +114,9 @@ class _Document:
         if uri.startswith("data:"):
             self.budget.take(len(uri), "buffer")
             return base64.b64decode(uri.partition(",")[2])
-        beside = self.path.parent / uri
-        if Path(uri).name != uri:
+        name = unquote(uri)
+        beside = self.path.parent / name
+        if Path(name).name != name:
             raise InputError("buffer of the glTF file", expected="a file beside it", got=uri)
         return existing_file(beside, what="buffer").read_bytes()
 
@@ -144,7 +146,9 @@ def _read(document: _Document) -> tuple[MocapTree, dict[str, int] | None]:
     if not animations:
         raise InputError("glTF file", expected="an animation", got="none")
     parents = _parents(nodes)
-    animation = animations[0]
+    turned = [sum(channel["target"]["path"] == "rotation" for channel in one["channels"]) for one in animations]
+    taken = next(k for k, count in enumerate(turned) if 2 * count >= max(turned))  # not a face's or a camera's
+    animation = animations.pop(taken)
     tracks = _channels(document, animation, len(nodes))
     if not tracks:
         raise InputError("animation", expected="rotations of nodes", got="none")
@@ -157,9 +161,9 @@ def _read(document: _Document) -> tuple[MocapTree, dict[str, int] | None]:
     above = [-1, *(1 + kept.index(parents[node]) if parents[node] in joints else 0 for node in kept)]
     still = np.zeros((len(times), 1, 3)), np.tile(np.eye(3), (len(times), 1, 1, 1))
     notes: tuple[str, ...] = ()
-    if len(animations) > 1:
-        others = ", ".join(str(other.get("name", k)) for k, other in enumerate(animations[1:], 1))
-        notes = (f"of the file's animations {animation.get('name', 0)} is taken; left out: {others}",)
+    if animations:
+        others = ", ".join(str(other.get("name", "one without a name")) for other in animations)
+        notes = (f"of the file's animations {animation.get('name', taken)} is taken; left out: {others}",)
     world = np.concatenate([still[0], positions[:, kept]], 1), np.concatenate([still[1], rotations[:, kept]], 1)
     tree = world_tree(names, above, *world, fps, notes)
     humanoid = _humanoid(document.json)
@@ -231,7 +235,8 @@ def _sampled(track: tuple[Floats, Floats, str], times: Floats, rotation: bool) -
     step = np.maximum(keys[after] - keys[after - 1], 1e-9)
     t = np.clip((times - keys[after - 1]) / step, 0, 1)[:, None]
     if method == "STEP":
-        return np.where(times[:, None] >= keys[after][:, None], values[after], values[after - 1])
+        reached = times >= keys[after] - _ROUNDED * step  # keys are single-precision
+        return np.where(reached[:, None], values[after], values[after - 1])
     if method == "CUBICSPLINE":
         (_, a, out), (into, b, _) = values[after - 1].swapaxes(0, 1), values[after].swapaxes(0, 1)
         out, into = step[:, None] * out, step[:, None] * into
@@ -257,7 +262,10 @@ def _world(
     tracks: dict[tuple[int, str], tuple[Floats, Floats, str]],
     times: Floats,
 ) -> tuple[list[int], Floats, Floats]:
-    """Nodes with parents first, their world positions [F, N, 3], and rotations [F, N, 3, 3] without scale."""
+    """Nodes with parents first, their world positions [F, N, 3], and rotations [F, N, 3, 3] without scale.
+
+    Those of a mirrored node are its matrices times −1, as fixed to it as its own axes.
+    """
     depth = {-1: -1}
     for node in range(len(nodes)):
         chain = [node]
@@ -277,15 +285,15 @@ def _world(
         if (np.linalg.norm(quaternion, axis=-1) < 1e-6).any():
             raise InputError(f"rotation of node {node}", expected="a quaternion", got="zero")
         turn = quaternion_to_matrix(quaternion[..., [3, 0, 1, 2]])
-        local = turn * scale[..., None, :]
+        local, flipped = turn * scale[..., None, :], turn * np.where(scale < 0, -1.0, 1.0)[..., None, :]
         above = parents[node]
         if above < 0:
-            linear[:, node], rotations[:, node], positions[:, node] = local, turn, place
+            linear[:, node], rotations[:, node], positions[:, node] = local, flipped, place
         else:
-            linear[:, node], rotations[:, node] = linear[:, above] @ local, rotations[:, above] @ turn
+            linear[:, node], rotations[:, node] = linear[:, above] @ local, rotations[:, above] @ flipped
             step = np.einsum("fij,fj->fi", linear[:, above], np.broadcast_to(place, (len(times), 3)))
             positions[:, node] = positions[:, above] + step
-    return order, positions, rotations
+    return order, positions, rotations * np.sign(np.linalg.det(rotations))[..., None, None]
 
 
 def _rest(node: dict[str, Any]) -> tuple[Floats, Floats, Floats]:

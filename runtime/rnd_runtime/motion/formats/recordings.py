@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import is_zipfile
 
 import numpy as np
 
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.files import is_folder
+from rnd_runtime.core.files import existing_file, is_folder
 from rnd_runtime.core.npz import Members, Npz
 from rnd_runtime.motion.readers.arrays import MotionRecord, read_arrays
 from rnd_runtime.motion.readers.asf_amc import read_amc
@@ -27,6 +28,7 @@ from .soma import gemx, is_gemx, is_kimodo, is_somax, kimodo, somax
 from .vectors import JointPaths, is_mdm_result, is_named_vector, mdm_result, named_vector, read_vector
 
 _PICKLES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
+_KNOWN = (".bvh", ".amc", ".npz", *GLTF, *_PICKLES)
 _BLENDER = "import it into Blender and export the armature as .bvh or .glb"
 _MARKERS = "markers are no skeleton: solve them to one first (Vicon, OptiTrack, OpenSim), and export that as .bvh"
 _ELSEWHERE = {
@@ -71,9 +73,9 @@ def read_recording(
     try:
         if is_folder(path):
             return _folder(path)
-        if suffix in _ELSEWHERE:
-            expected = "a .bvh, .glb, .npz or another documented motion"
-            raise InputError("motion", expected=expected, got=f"a {suffix} file", file=path, hint=_ELSEWHERE[suffix])
+        if suffix in _ELSEWHERE or (suffix not in _KNOWN and not is_zipfile(existing_file(path, what="motion"))):
+            expected, got = "a .bvh, .glb, .npz or another documented motion", f"a {suffix or 'nameless'} file"
+            raise InputError("motion", expected=expected, got=got, file=path, hint=_ELSEWHERE.get(suffix))
         if suffix == ".bvh":
             from rnd_runtime.motion.readers.bvh import read_bvh  # here and below: most runs read arrays
 
