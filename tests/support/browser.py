@@ -106,6 +106,7 @@ def chromium(
     options = [
         *("--headless=new", "--no-sandbox", "--no-first-run", "--disable-background-networking"),
         *("--disable-component-update", "--hide-scrollbars", "--disable-dev-shm-usage", "--mute-audio"),
+        "--force-prefers-reduced-motion",  # or a motion would play from the start
         *(("--use-angle=swiftshader", "--enable-unsafe-swiftshader") if webgl else ("--disable-gpu",)),
         *(("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader") if webgpu else ()),
         *(f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}", "--remote-debugging-port=0"),

@@ -21,6 +21,7 @@ def ground_of(avatar: Avatar, motion: Motion) -> Plane:
     lowest = []
     for time in np.linspace(0, motion.duration, FRAMES):
         encoded = avatar.encode(motion, float(time))
-        heights = avatar.posed(encoded).means @ encoded.root[1, :3] + encoded.root[1, 3]
+        means = avatar.posed(encoded).means
+        heights = means[np.isfinite(means).all(axis=1)] @ encoded.root[1, :3] + encoded.root[1, 3]
         lowest.append(np.percentile(heights, 0.05))  # a few Gaussians may stray
     return Plane(UP, float(np.percentile(lowest, STANDING)))

@@ -106,6 +106,33 @@ def test_slow_frames_take_fewer_pixels_and_fast_ones_more(page):
     assert scales[0] < 1 and min(scales) == 0.5 and scales[-1] > scales[2]
 
 
+def test_it_plays_from_the_start_over_a_ground_unless_a_link_or_less_motion_is_asked_for(opened, page):
+    assert page.run("[rnd.state.time, rnd.state.background, rnd.state.ground]") == [0, "#808080", True]
+    address = opened[1].split("?")[0]
+    page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-reduced-motion", "value": "no-preference"}])
+    try:
+        for link, plays in (("?plays", True), ("?still#time=0.4", False)):
+            page.open(address + link)
+            page.wait("location.href.endsWith('" + link + "') && window.rnd && rnd.scene()")
+            page.run(DRAWN)
+            assert page.run("document.getElementById('play').textContent") == ("❚❚" if plays else "▶")
+    finally:
+        page.call("Emulation.setEmulatedMedia", features=[])
+
+
+def test_the_whole_screen_shows_the_image_alone_and_messages_outlast_frames(page):
+    page.run("document.getElementById('full').click()")
+    page.wait("document.fullscreenElement && document.querySelector('aside').clientWidth <= 1")
+    page.wait(f"{PANE}[0] === innerWidth && rnd.state.width === innerWidth")
+    page.press("KeyF")
+    page.wait("!document.fullscreenElement && document.querySelector('aside').clientWidth > 1")
+    page.run("Object.defineProperty(navigator, 'clipboard', { value: undefined, configurable: true })")
+    _click(page, "#share")
+    for _ in range(3):
+        page.run(DRAWN)
+    assert page.run("document.getElementById('message').textContent") == "this page's address now holds what you see"
+
+
 def test_presets_and_undo(page):
     home = page.run("({ ...rnd.state })")
     _click(page, "[data-preset=back]")
@@ -130,9 +157,11 @@ def test_a_link_holds_what_is_seen(page):
     page.open("about:blank")
     page.open(address)
     page.wait("window.rnd && rnd.scene()")
-    assert page.run("({ ...rnd.state })") == state
+    for name, value in page.run("({ ...rnd.state })").items():
+        wanted = state[name] if value is None or isinstance(value, str | bool) else pytest.approx(state[name], abs=1e-5)
+        assert value == wanted, name
     page.open("about:blank")
-    page.open(address.split("#")[0] + "#%7B%22yaw%22%3A%22x%22%2C%22target%22%3A%5B1%5D%7D")  # of other types
+    page.open(address.split("#")[0] + "#yaw=x&target=1,2&ground=2&time=NaN")  # of other types
     page.wait("window.rnd && rnd.scene()")
     assert page.run("[rnd.state.yaw, rnd.state.target.length]") == [0, 3]
 
@@ -244,7 +273,7 @@ def test_the_background_is_of_any_colour(page):
 def test_every_mode_says_what_it_is(page):
     modes = "[...document.querySelectorAll('#output button, .choices button, #shade option, #tone option')]"
     titles = page.run(f"{modes}.map(({{ title }}) => title)")
-    assert len(titles) == 9 + 6 + 6 + 2 == len({*titles} - {""})
+    assert len(titles) == 8 + 6 + 6 + 2 == len({*titles} - {""})
     page.run("rnd.state.shade = 'brute'; rnd.redraw()")
     page.wait("document.getElementById('shade').title.startsWith('every texel')")
 

@@ -115,7 +115,7 @@ def _set(page: Page, control: str, value: str) -> None:
 def test_the_canvas_shows_rnd_plays_frame_and_relights(page, played):
     page.run("rnd.play(false)")
     fps = page.run("rnd.scene().motion.fps")
-    assert (_frame(page, f"time: {FRAME} / {fps}") == read_image(played["straight"])).all()
+    assert (_frame(page, f"time: {FRAME} / {fps}, background: 'none'") == read_image(played["straight"])).all()
     _set(page, "yaw", "90")
     assert (_frame(page) == read_image(played["turned"])).all()
     # shift and drag turn the light too: 0.01 rad for each pixel
@@ -267,7 +267,7 @@ def test_with_a_token_and_in_jpeg(page, scene):
     with _serving(scene) as url:
         page.open(f"{url}&encoding=jpeg")
         page.wait("location.search.includes('s3cret') && window.rnd && rnd.scene()")
-        page.run("Object.assign(rnd.state, {time: 0.5}); rnd.frame(false).then(() => 1)")
+        page.run("Object.assign(rnd.state, {time: 0.5, background: 'none'}); rnd.frame(false).then(() => 1)")
         error = np.abs(_pixels(page) - exact)
         assert 0 < error.mean() < 2  # halved chroma at the edges
         assert (_frame(page) == exact).all()  # a screenshot is exact all the same

@@ -40,7 +40,7 @@ from .state import ViewState
 Floats32 = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
-CLAY = np.float32(0.8)  # albedo of the output "light"
+CLAY = np.float32(0.18)  # a grey card's, albedo of the output "light"
 MAX_SHADERS = 12  # tables of up to 1.5 MB each; building one takes 30–300 ms
 LARGEST_SKY = 1024  # rows of a cached background map: 25 MB
 

@@ -26,14 +26,14 @@ const $ = (id) => document.getElementById(id);
 
 const state = {
   time: 0, width: 512, height: 512, azimuth: 0, elevation: 0, distance: 3, target: [0, 1, 0], fov: 0.6,
-  light: 0, yaw: 0, exposure: 0, shade: "table+sun", output: "lit", background: "none", tone: "srgb", ground: true, gaussians: null, truth: null,
+  light: 0, yaw: 0, exposure: 0, shade: "table+sun", output: "lit", background: "#808080", tone: "srgb", ground: true, gaussians: null, truth: null,
 };
 let scene = null, engine = null, playing = false, playedSince = 0;
 let number = 0, shown = 0, wanted = false, flying = new Map();
 let waiting = [];  // {number, done, failed} of awaited frames
 let clipMade = null;  // while a clip is made: {promise, resolve} of its end
 let times = {}, rates = [], shownAt = 0;
-let passing = true;  // the next frame clears the message
+let passing = true, fading = 0;  // the next frame clears the message; or a timer does
 let joints = [];  // of the last frame, px of the state's size
 const fit = new Fit($("stage").firstElementChild, state, redraw);
 
@@ -154,9 +154,11 @@ function play(on) {
   redraw();
 }
 
-/** Show a message until the next one or, with `untilFrame`, until the next frame. */
-function say(text, { wrong = false, untilFrame = false } = {}) {
+/** Show a message until the next one, with `untilFrame` until the next frame, or for some `seconds`. */
+function say(text, { wrong = false, untilFrame = false, seconds = 0 } = {}) {
   passing = untilFrame;
+  clearTimeout(fading);
+  if (seconds) fading = setTimeout(() => say(""), 1000 * seconds);
   $("message").textContent = text;
   $("message").classList.toggle("wrong", wrong);
 }
@@ -203,17 +205,18 @@ function setScene(description) {
   fit.start($("fit").checked, scene.sizes);
   if (moved) home();
   if (moved) views.forget();
-  if (first) restore();
+  if (first && !restore() && !matchMedia("(prefers-reduced-motion)").matches) play(true);
   showNotes();
   say(first ? "loading …" : "", { untilFrame: true });
   redraw();
 }
 
-/** Take the state that the page's address holds. */
+/** Take the state that the page's address holds; whether it holds one. */
 function restore() {
-  views.restore();
+  const given = views.restore();
   $("ground").checked = state.ground;
   $("gaussians").value = 100 * (state.gaussians ?? scene.gaussians) / scene.gaussians;
+  return given;
 }
 
 /** The slider's share of this avatar's Gaussians. */

@@ -7,17 +7,22 @@ export function addressWith(state) {
   const address = new URL(location.href);
   const words = address.search.slice(1).split("&");  // as they are: a list's commas are not to be encoded
   address.search = words.filter((word) => !word.startsWith("token=")).join("&");
-  address.hash = encodeURIComponent(JSON.stringify(Object.fromEntries(KEPT.map((name) => [name, state[name]]))));
+  const kept = KEPT.filter((name) => state[name] !== null).map((name) => [name, [state[name]].flat().map(short).join()]);
+  address.hash = new URLSearchParams(kept);
   return address.href;
 }
 
-/** What of `state` the page's address holds; nothing where it is damaged. */
+const short = (value) => (typeof value === "number" ? Number(value.toPrecision(6)) : value);
+
+/** What of `state` the page's address holds; what is damaged is left out. */
 export function stateOfAddress(state) {
-  let given = null;
-  try { given = JSON.parse(decodeURIComponent(location.hash.slice(1))); } catch { /* not ours */ }
-  if (given === null || typeof given !== "object") return {};
-  const fits = (value, like) => (Array.isArray(like) ? Array.isArray(value) && value.length === like.length && value.every(Number.isFinite)
-    : typeof value === typeof like);
-  return Object.fromEntries(KEPT.map((name) => [name, given[name]]).filter(([name, value]) =>
-    fits(value, state[name]) || (name === "gaussians" && Number.isInteger(value))));
+  const read = (name, text) => {
+    const like = name === "gaussians" ? 0 : state[name], numbers = text.split(",").map(Number);
+    if (typeof like === "boolean") return { true: true, false: false }[text];
+    if (typeof like === "string") return text;
+    if (numbers.length !== [like].flat().length || !numbers.every(Number.isFinite)) return undefined;
+    return Array.isArray(like) ? numbers : numbers[0];
+  };
+  const given = [...new URLSearchParams(location.hash.slice(1))].filter(([name]) => KEPT.includes(name));
+  return Object.fromEntries(given.map(([name, text]) => [name, read(name, text)]).filter(([, value]) => value !== undefined));
 }

@@ -5,6 +5,7 @@ import { addressWith, stateOfAddress } from "./share.js";
 
 const MAX_UNDO = 50;
 const ONE_GESTURE_MS = 500;  // between turns of a wheel
+const READ = { seconds: 4 };  // of a message
 const $ = (id) => document.getElementById(id);
 
 /**
@@ -36,35 +37,40 @@ export function bindViews(state, page) {
   };
   const key = () => {
     keys = [...keys.filter(({ time }) => time !== state.time), { time: state.time, view: viewOf(state) }];
-    page.say(`the camera's path has keys at ${keys.map(({ time }) => time.toFixed(2)).sort().join(", ")} s`, { untilFrame: true });
+    page.say(`the camera's path has keys at ${keys.map(({ time }) => time.toFixed(2)).sort().join(", ")} s`, READ);
   };
   const path = () => {
     if (!keys.length) key();
     const text = JSON.stringify(pathOf(keys, page.scene().motion, state.width, state.height));
     page.download(new Blob([text], { type: "application/json" }), "camera.json");
-    page.say("rnd-play --camera camera.json takes this path", { untilFrame: true });
+    page.say("rnd-play --camera camera.json takes this path", READ);
   };
   const share = () => {
     const address = addressWith(state);
     history.replaceState(null, "", address);
-    navigator.clipboard?.writeText(address).catch(() => {});
-    page.say("copied: this page's address now holds what you see", { untilFrame: true });
+    const told = (how) => page.say(`${how}this page's address now holds what you see`, READ);
+    if (navigator.clipboard) navigator.clipboard.writeText(address).then(() => told("copied: "), () => told(""));
+    else told("");  // as browsers have it for hosts without https
   };
   const full = () => {
     if (document.fullscreenElement) document.exitFullscreen();
-    else document.documentElement.requestFullscreen?.().catch(() => page.say("this browser has no full screen", { wrong: true }));
+    else document.documentElement.requestFullscreen().catch(() => page.say("this browser allows no full screen", { wrong: true }));
   };
   const restore = () => {
     const given = stateOfAddress(state);
     if (!(given.light < page.scene().lights.length)) delete given.light;
     Object.assign(state, given, { ground: Boolean(given.ground ?? state.ground) && Boolean(page.scene().ground) });
+    return Object.keys(given).length > 0;
   };
 
   for (const kind of ["pointerdown", "wheel"]) $("stage").addEventListener(kind, remember, { capture: true, passive: true });
   for (const [id, act] of Object.entries({ undo, key, path, share, full })) $(id).addEventListener("click", act);
   for (const button of document.querySelectorAll("[data-preset]")) button.addEventListener("click", () => look(button.dataset.preset));
+  $("full").hidden = !document.fullscreenEnabled;
   document.addEventListener("keydown", (event) => {
-    if (event.code === "KeyZ" && (event.ctrlKey || event.metaKey) && page.scene()) undo();
+    const ctrl = event.ctrlKey || event.metaKey;
+    if (event.code === "KeyZ" && ctrl && page.scene()) undo();
+    if (event.code === "KeyF" && !ctrl && !$("full").hidden && !event.target.matches("select")) full();
   });
   return { remember, restore, forget: () => { keys = []; } };
 }

@@ -22,7 +22,7 @@ export async function groundOf(avatar, motion) {
     const { means, count, root } = avatar.posed(await avatar.encode(motion, k / (FRAMES - 1) * motion.duration));
     const [x, y, z] = root.rotation.subarray(3, 6), heights = new Float64Array(count);
     for (let i = 0; i < count; i++) heights[i] = x * means[3 * i] + y * means[3 * i + 1] + z * means[3 * i + 2] + root.translation[1];
-    lowest.push(percentile(heights, LOWEST));
+    lowest.push(percentile(heights.filter(Number.isFinite), LOWEST));
   }
   return percentile(Float64Array.from(lowest), STANDING);
 }
