@@ -295,8 +295,9 @@ def _likely_unit(translations: Floats, fps: float, up: str) -> str:
     """The unit of ``translations`` that are not a person's in metres; "" of those that may be."""
     heights = np.abs(translations[:, "xyz".index(up)])
     speeds = np.linalg.norm(np.diff(translations, axis=0), axis=1) * fps
-    beyond = max(float(np.median(heights)) / _MAX_HEIGHT, float(np.median(speeds)) / _MAX_SPEED if len(speeds) else 0)
-    return "" if beyond <= 1 else "centimetres" if beyond < 10 else "millimetres"
+    if (height := float(np.median(heights))) > _MAX_HEIGHT:
+        return "centimetres" if height < 10 * _MAX_HEIGHT else "millimetres"
+    return "millimetres or centimetres" if len(speeds) and np.median(speeds) > _MAX_SPEED else ""
 
 
 def _rate_of_times(archive: Members, frames: int, notes: list[str]) -> float | None:
