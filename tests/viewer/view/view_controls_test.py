@@ -194,6 +194,16 @@ def test_a_path_through_keys_is_rnd_plays_camera(page, tmp_path):
         camera, expected = path(round(state.time * fps), state.time), state.camera()
         np.testing.assert_allclose(camera.K, expected.K)
         np.testing.assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
+    page.run("rnd.state.azimuth = 0; rnd.state.time = 0.5")
+    _click(page, "#follow")
+    page.wait("rnd.state.azimuth !== 0")
+    np.testing.assert_allclose(page.run("[rnd.state.azimuth, rnd.state.distance]"), [-3.0 + 2 * np.pi, 2.0], atol=1e-9)
+    page.drag((200, 200), (60, 0))  # which ends it
+    page.run(DRAWN)
+    assert page.run("rnd.state.azimuth") == pytest.approx(-3.0 + 2 * np.pi - 0.6)
+    for _ in range(4):  # the drag, and the keys
+        _click(page, "#undo")
+    assert page.run("document.getElementById('message').textContent") == "the camera's path has no keys"
     positions = np.array([path(number, 0).position for number in range(round(fps) + 1)])
     assert np.linalg.norm(np.diff(positions, axis=0), axis=1).max() < 0.15  # the long way round would be 0.6
 
@@ -231,6 +241,10 @@ def test_a_phone_is_worked_by_thumb_and_finger(page, tmp_path):
     _touch(page, "touchMove", (200, 200))
     _touch(page, "touchEnd")
     assert page.run("rnd.state.azimuth") == pytest.approx(before["azimuth"] - 0.5)
+    at = page.run("(({ left, top }) => [left + 9, top + 9])(document.getElementById('full').getBoundingClientRect())")
+    _touch(page, "touchStart", at)  # a held finger is told what the control does
+    page.wait("document.getElementById('message').textContent.startsWith('the image alone')")
+    _touch(page, "touchCancel")
 
 
 def test_the_sun_of_the_small_sphere_is_dragged(page):
@@ -273,7 +287,7 @@ def test_the_background_is_of_any_colour(page):
 def test_every_mode_says_what_it_is(page):
     modes = "[...document.querySelectorAll('#output button, .choices button, #shade option, #tone option')]"
     titles = page.run(f"{modes}.map(({{ title }}) => title)")
-    assert len(titles) == 8 + 6 + 6 + 2 == len({*titles} - {""})
+    assert len(titles) == 9 + 6 + 6 + 2 == len({*titles} - {""})
     page.run("rnd.state.shade = 'brute'; rnd.redraw()")
     page.wait("document.getElementById('shade').title.startsWith('every texel')")
 

@@ -53,6 +53,7 @@ function step(now) {
   if (scene && !playing && flying.size === 0 && fit.isCoarse(now)) wanted = true;
   if (wanted && scene && flying.size < IN_FLIGHT) {
     wanted = false;
+    views.follow();
     ask(false);
     showState();
   }

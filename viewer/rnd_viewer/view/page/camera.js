@@ -40,15 +40,20 @@ export function preset(name, home, state, joints, head) {
   return fitted(view, state);
 }
 
-/** Cameras for rnd-play, one a frame, through `keys` [{time, view}]: {cameras: [{width, height, K, world_to_camera}]}. */
-export function pathOf(keys, { fps, duration }, width, height) {
+/** The view at `time` of a path through `keys` [{time, view}]. */
+export function viewAt(keys, time) {
   const sorted = [...keys].sort((a, b) => a.time - b.time), times = sorted.map(({ time }) => time), turn = 2 * Math.PI;
   const rows = sorted.map(({ view }) => [view.azimuth, view.elevation, view.distance, ...view.target, view.fov]);
   for (let k = 1; k < rows.length; k++) rows[k][0] -= turn * Math.round((rows[k][0] - rows[k - 1][0]) / turn);
+  const [azimuth, elevation, distance, x, y, z, fov] = rows[0].map((_, c) => between(times, rows.map((row) => row[c]), time));
+  return { azimuth, elevation, distance, target: [x, y, z], fov };
+}
+
+/** Cameras for rnd-play, one a frame, of the path through `keys`: {cameras: [{width, height, K, world_to_camera}]}. */
+export function pathOf(keys, { fps, duration }, width, height) {
   const count = Math.floor(duration * fps + 1e-4) + 1;
   return { cameras: Array.from({ length: count }, (_, frame) => {
-    const [azimuth, elevation, distance, x, y, z, fov] = rows[0].map((_, c) => between(times, rows.map((row) => row[c]), frame / fps));
-    const { focal, centre, rotation: r, translation: t } = cameraOf({ azimuth, elevation, distance, target: [x, y, z], fov, width, height });
+    const { focal, centre, rotation: r, translation: t } = cameraOf({ ...viewAt(keys, frame / fps), width, height });
     const world = [0, 3, 6].map((row) => [...r.slice(row, row + 3), t[row / 3]]);
     return { width, height, K: [[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]], world_to_camera: [...world, [0, 0, 0, 1]] };
   }) };
