@@ -140,6 +140,12 @@ def _luminance_chroma(path: Path) -> Path:
     return path
 
 
+def test_cie_xyz_is_no_luminance_alone(tmp_path):
+    write_image(tmp_path / "a.exr", np.ones((4, 8, 3), np.float32), channel_names=("X", "Y", "Z"))
+    with pytest.raises(InputError, match=r"a\.exr: light probe: expected R, G and B, got CIE XYZ \(X, Y, Z\)"):
+        load_light(tmp_path / "a.exr")
+
+
 def test_luminance_and_chroma_are_refused_by_name(tmp_path):
     with pytest.raises(InputError, match=r"a\.exr: .*(luminance and chroma|ubsampled)"):
         load_light(_luminance_chroma(tmp_path / "a.exr"))

@@ -128,6 +128,19 @@ def test_wide_gamut_is_converted(tmp_path, primaries) -> None:
 _NAMES = {9: "bt2020", 12: "smpte432"}
 
 
+@pytest.mark.parametrize(("transfer", "named"), [("linear", "linear"), ("log100", "logarithmic")])
+def test_other_transfer_functions_are_refused_by_name(tmp_path, transfer, named) -> None:
+    path = tmp_path / "log.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25, options={"x264-params": f"transfer={transfer}"})
+        stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, "yuv420p"
+        image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode(None))
+    with pytest.raises(InputError, match=rf"log\.mp4: transfer function of the video: expected .*, got {named}$"):
+        VideoFile(path)
+
+
 @pytest.mark.parametrize("rows", [(-1, 0, 0, 1), (1, 0, 0, -1), (0, 1, 1, 0), (0, -1, -1, 0), (-1, 0, 0, -1)])
 def test_a_display_matrix_mirrors_and_rotates(tmp_path, rows) -> None:
     """a, b, c, d of a track's header: x' = a x + c y, y' = b x + d y (ISO 14496-12)."""

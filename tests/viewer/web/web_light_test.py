@@ -142,6 +142,15 @@ def test_repaired_texels_are_reported(tmp_path):
     assert _page(tmp_path / "sky.exr")["notes"][0].startswith("2 texels")
 
 
+def test_a_sun_that_half_floats_cut_is_their_largest_number(tmp_path):
+    pixels = RADIANCE.copy()
+    pixels[3, 4] = pixels[3, 5, 1] = np.inf
+    _assert_the_same(file := _exr(tmp_path / "sky.exr", pixels))
+    answer = _page(file)
+    assert max(answer["radiance"]) == 65504 and answer["notes"] == light_notes(load_light(file))
+    assert answer["notes"][0].startswith("2 texels of the light were infinite")
+
+
 FIVE = np.concatenate([RADIANCE, np.ones((HEIGHT, 2 * HEIGHT, 2), np.float16)], axis=2)
 RGB_AND = ("R", "G", "B", "A", "id")
 

@@ -41,6 +41,8 @@ def colour_channels(names: tuple[str, ...], path: str | Path) -> tuple[list[int]
     luminance = [name for name in names if name.split(".")[-1] == "Y"]
     if {"RY", "BY"} & {name.split(".")[-1] for name in names}:
         raise InputError("light probe", expected="R, G and B", got="luminance and chroma (Y, RY, BY)", file=path)
+    if {"X", "Y", "Z"} <= set(names):
+        raise InputError("light probe", expected="R, G and B", got="CIE XYZ (X, Y, Z)", file=path)
     if not found and len(luminance) == 1:
         return [names.index(luminance[0])] * 3, ("the light has luminance alone: it is taken as grey",)
     expected = "channels R, G and B" + (" of one layer" if found else "")

@@ -34,6 +34,7 @@ _TO_BT709 = {
     ),
 }
 _MATRICES = {1: "itu709", 4: "fcc", 5: "itu601", 6: "itu601", 7: "smpte240m", 9: "bt2020"}
+_UNREAD_TRANSFERS = {8: "linear", 9: "logarithmic", 10: "logarithmic", 17: "SMPTE ST 428"}
 _UNREAD = {8: "YCgCo", 10: "BT.2020 of constant luminance", 11: "YDzDx", 12: "chromaticity-derived", 14: "ICtCp"}
 
 
@@ -41,11 +42,15 @@ def colour_notes(frame: Any) -> tuple[str, ...]:
     """What the conversion of ``frame`` changes beyond SDR's usual one, one sentence.
 
     Raises:
-        InputError: a colour matrix that is not read, or Dolby Vision without a base layer that others can show.
+        InputError: a colour matrix or transfer function that is not read, or Dolby Vision without a base layer that
+            others can show.
     """
     if (matrix := int(frame.colorspace)) in _UNREAD:
         raise InputError("colour matrix of the video", expected="BT.601, BT.709 or BT.2020", got=_UNREAD[matrix])
     transfer, primaries = int(frame.color_trc), int(frame.color_primaries)
+    if transfer in _UNREAD_TRANSFERS:
+        expected, got = "BT.709, sRGB, HLG or PQ", _UNREAD_TRANSFERS[transfer]
+        raise InputError("transfer function of the video", expected=expected, got=got)
     dolby = any("DOVI" in str(data.type) for data in frame.side_data)
     if dolby and transfer == _UNSPECIFIED:
         hint = "export it as HLG or SDR"

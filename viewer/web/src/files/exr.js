@@ -5,12 +5,12 @@ import { refusal } from "../errors.js";
 
 const MAGIC = 20000630, TILED = 0x200, DEEP = 0x800, PARTS = 0x1000;
 const FLOAT_TYPE = 1015;  // parse-exr's name for 32-bit floats
-const UINT = 0, DECREASING_Y = 1;
+const UINT = 0, HALF = 1, DECREASING_Y = 1;
 const COMPRESSIONS = ["none", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"];
 const BLOCK_LINES = { none: 1, RLE: 1, ZIPS: 1, ZIP: 16, PIZ: 32, PXR24: 16, DWAA: 32, DWAB: 256 };  // supported ones
 
 /**
- * {height, width, radiance: Float32Array [H·W·3], chromaticities} of one flat image with channels R, G and B;
+ * {height, width, radiance: Float32Array [H·W·3], half, chromaticities} of one flat image with channels R, G and B;
  * chromaticities [8]: x and y of red, green, blue and white, if given.
  */
 export function readExr(file) {
@@ -23,7 +23,8 @@ export function readExr(file) {
     for (let column = 0; column < width; column++)
       for (let c = 0; c < 3; c++)
         radiance[3 * (row * width + column) + c] = data[channels * ((height - 1 - row) * width + column) + c];
-  return { width, height, radiance, chromaticities: header.chromaticities };
+  const half = header.channels.find(({ name }) => name === "R").type === HALF;
+  return { width, height, radiance, half, chromaticities: header.chromaticities };
 }
 
 /** The header: {tiled, flat, channels, chromaticities, compression, lineOrder, lineOrderAt, data and canvas windows, end}. */

@@ -4,27 +4,28 @@ import { COARSE, DIM, MAX_EXPOSURE, REC709, REC709_LUMINANCE, SAME_COLOUR } from
 import { refusal, short } from "../errors.js";
 import { readExr } from "../files/exr.js";
 
-const LARGEST_FLOAT = 3.4028234663852886e38;
+const LARGEST_FLOAT = 3.4028234663852886e38, LARGEST_HALF = 65504;
 const RGBE = "FORMAT=32-bit_rle_rgbe";
 
 const [LUMA_R, LUMA_G, LUMA_B] = REC709_LUMINANCE;
 export const luminance = (r, g, b) => LUMA_R * r + LUMA_G * g + LUMA_B * b;
 
-/** {height, width, radiance: Float32Array [H·W·3], repaired, chromaticities} of an .exr or .hdr file. */
+/** {height, width, radiance: Float32Array [H·W·3], cut, repaired, chromaticities} of an .exr or .hdr file. */
 export function readLight(bytes, name) {
   const image = name.toLowerCase().endsWith(".exr") ? readExr(bytes) : readHdr(bytes);
   if (image.width !== 2 * image.height) throw new Error(`${name}: expected a 2:1 lat-long map, got ${image.width} x ${image.height}`);
-  return repair({ ...image, name });
+  return repair({ ...image, name, cut: image.half ? limitHalf(image.radiance) : 0 });
 }
 
 /** Notes on a light for the user. */
-export function lightNotes({ radiance, repaired, chromaticities, exposure = 1 }) {
+export function lightNotes({ radiance, cut, repaired, chromaticities, exposure = 1 }) {
   const notes = [];
   if (exposure !== 1) notes.push(`the light's pixels are divided by the exposure that its file states, ${short(exposure, 4)}`);
   if (chromaticities?.some((value, k) => !(Math.abs(value - REC709[k]) <= SAME_COLOUR))) {
     const [red, green, blue, white] = [0, 2, 4, 6].map((k) => `(${short(chromaticities[k], 4)}, ${short(chromaticities[k + 1], 4)})`);
     notes.push(`the light is taken as Rec.709, but its file states red ${red}, green ${green}, blue ${blue} and white ${white}`);
   }
+  if (cut) notes.push(`${cut} texels of the light were infinite and are taken as ${LARGEST_HALF}, HALF's largest number: a sun was cut`);
   if (repaired) notes.push(`${repaired} texels of the light were NaN, infinite or negative and were filled in`);
   if (radiance.every((value) => value < DIM)) {
     const largest = radiance.reduce((a, b) => Math.max(a, b), 0);
@@ -94,6 +95,17 @@ function readScanline(bytes, at, width, row) {
     filled += length;
   }
   return at;
+}
+
+/** Replace +inf in `radiance` of half floats by the largest of them; in how many texels. */
+function limitHalf(radiance) {
+  const texels = new Set();
+  radiance.forEach((value, k) => {
+    if (value !== Infinity) return;
+    radiance[k] = LARGEST_HALF;
+    texels.add(Math.floor(k / 3));
+  });
+  return texels.size;
 }
 
 /** Fill NaN, infinite and negative values from their valid neighbours, from the rim of holes inwards. */
