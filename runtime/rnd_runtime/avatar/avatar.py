@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import Future
-from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -77,6 +76,7 @@ class Avatar:
         self._albedo = np.minimum(albedo, np.float32(LARGEST_ALBEDO))
         self.posed_outside = networks.posed_outside
         self._rest = _rest_pose(networks) if networks.posed_outside else None
+        self._levels = [self]
 
     @classmethod
     def load(cls, path: str | Path, *, threads: int | None = None, ahead: Future[Networks] | None = None) -> Avatar:
@@ -95,32 +95,33 @@ class Avatar:
         except InputError as error:
             raise error.at(file=path) from error
 
-    @cached_property
-    def levels(self) -> tuple[Avatar, ...]:
-        """This avatar and coarser ones, for fewer and fewer pixels; made on first use, in a second.
+    def level(self, number: int) -> Avatar | None:
+        """At a level of detail: 0 is itself, others are for fewer and fewer pixels; None beyond the coarsest.
 
-        The second has all Gaussians and a share of the nodes, where the file allows that; others have no more nodes.
+        The first has all Gaussians and a share of the nodes, where the file allows that; others have no more nodes.
+        They are made on first use, each in a twentieth of a second, and kept.
         """
-        levels = [self]
-        if self._rest is not None and self._networks.alike:
+        while len(self._levels) <= number:
+            coarser = self._levels[-1]._next_level()
+            if coarser is None:
+                return None
+            self._levels.append(coarser)
+        return self._levels[number]
+
+    def _next_level(self) -> Avatar | None:
+        if self._rest is not None and self._networks.can_leave_out_nodes:
             kept = np.arange(0, self.nodes, NODES_SHARE)
-            fewer_nodes = shallow_copy(self, nodes=len(kept))
-            fewer_nodes._networks = self._networks.at_nodes(kept.tolist())
-            fewer_nodes._rest = on_fewer_nodes(self._rest, kept)
-            levels.append(fewer_nodes)
-        while self._rest is not None and (count := levels[-1].gaussians) > MIN_GAUSSIANS:
-            finer = levels[-1]
-            assert finer._rest is not None
-            rest, opacities, albedo, roughness = coarser(
-                Surface(finer._rest, finer._opacities, finer._albedo, finer._roughness)
-            )
-            fewer = len(opacities)
-            if fewer == count:
-                break
-            level = shallow_copy(finer, gaussians=fewer, spacing=self.spacing * math.sqrt(self.gaussians / fewer))
-            level._rest, level._opacities, level._albedo, level._roughness = rest, opacities, albedo, roughness
-            levels.append(level)
-        return tuple(levels)
+            level = shallow_copy(self, nodes=len(kept))
+            level._networks, level._rest = self._networks.at_nodes(kept.tolist()), on_fewer_nodes(self._rest, kept)
+            return level
+        if self._rest is None or self.gaussians <= MIN_GAUSSIANS:
+            return None
+        surface = coarser(Surface(self._rest, self._opacities, self._albedo, self._roughness))
+        if (fewer := len(surface.opacities)) == self.gaussians:
+            return None
+        level = shallow_copy(self, gaussians=fewer, spacing=self.spacing * math.sqrt(self.gaussians / fewer))
+        level._rest, level._opacities, level._albedo, level._roughness = surface
+        return level
 
     @property
     def node_spacing(self) -> float:
@@ -129,7 +130,7 @@ class Avatar:
     def scale_albedo(self, gain: Sequence[float]) -> None:
         """Multiply the albedo by ``gain`` [3] of linear R, G and B; it stays below what conserves energy.
 
-        ``levels`` made before stay.
+        Levels made before stay.
         """
         scaled = self._albedo * np.asarray(gain, np.float32)
         self._albedo = np.clip(scaled, 0, np.float32(LARGEST_ALBEDO))

@@ -79,14 +79,17 @@ class Networks:
         return self._file.outputs[NODE_OUTPUTS[0]][0] if self._rows is None else len(self._rows.kept)
 
     def at_nodes(self, kept: Sequence[int]) -> Networks:
-        """The same networks at some of the nodes, on one thread. ``posed_outside`` and ``alike`` alone."""
+        """The same networks at some of the nodes, on one thread."""
         parts = (tuple(output for part in self._parts for output in part),)
         return shallow_copy(self, _rows=Rows(self.nodes, kept), _sessions={}, _parts=parts, _threads=1)
 
     @property
-    def alike(self) -> bool:
-        """Whether all nodes are treated alike: none has the template's skinning, unless all have."""
-        return self.metadata.variant.dynamic_nodes in (0, self.nodes) and self.nodes != self.metadata.gaussians
+    def can_leave_out_nodes(self) -> bool:
+        """Whether ``at_nodes`` applies: all nodes are treated alike, all or none have the template's skinning."""
+        whole = self.posed_outside and self._rows is None
+        return (
+            whole and self.metadata.variant.dynamic_nodes in (0, self.nodes) and self.nodes != self.metadata.gaussians
+        )
 
     def at(self, inputs: tuple[ArrayLike, ArrayLike, ArrayLike]) -> list[Floats32]:
         """What ``run`` gives for the nodes, Δ logits first unless skinning is static; or the posed outputs."""

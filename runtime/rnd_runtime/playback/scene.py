@@ -71,7 +71,8 @@ class Person:
 
     def encode(self, time_s: float, level: int = 0) -> Encoded:
         """Its pose at ``time_s`` of the scene, at a level of detail."""
-        avatar = self.avatar.levels[level] if level else self.avatar
+        avatar = self.avatar.level(level)
+        assert avatar is not None
         encoded = avatar.encode(self.motion, time_s - self.start)
         return encoded._replace(root=self.place @ encoded.root)
 
@@ -100,14 +101,14 @@ def ground_under(people: Sequence[Person]) -> Plane:
     return min((ground_of(*pair) for pair in stands.values()), key=lambda plane: plane.offset)
 
 
-def greatest_sizes(levels: Sequence[Avatar]) -> Floats:
-    """Pixels per metre [L], falling, up to which each of an avatar's levels is taken."""
-    whole = levels[0]
-    sizes = [
-        LEVEL_SPACING / level.spacing if level.gaussians < whole.gaussians else NODE_SPACING / level.node_spacing
-        for level in levels[1:]
-    ]
-    return np.minimum.accumulate([np.inf, *sizes])
+def greatest_sizes(avatar: Avatar, smallest: float = 0.0) -> Floats:
+    """Pixels per metre [L], falling, up to which each level of detail is taken; to the first below ``smallest``."""
+    sizes = [np.inf]
+    while sizes[-1] >= smallest and (level := avatar.level(len(sizes))) is not None:
+        whole = level.gaussians == avatar.gaussians
+        size = NODE_SPACING / level.node_spacing if whole else LEVEL_SPACING / level.spacing
+        sizes.append(min(size, sizes[-1]))
+    return np.array(sizes)
 
 
 def chosen_levels(pixels_per_metre: Floats, greatest: Floats) -> NDArray[np.intp]:
@@ -150,8 +151,7 @@ class SceneRenderer:
         for number, person in enumerate(self.people):
             depths = (person.positions(times_s) * axes[:, :3]).sum(axis=1) + axes[:, 3] - MARGIN
             sizes = np.divide(axes[:, 4], depths, out=np.full(len(depths), np.inf), where=depths > NEAR)
-            if sizes.min() * person.avatar.node_spacing < NODE_SPACING:  # else they need not be made
-                levels[:, number] = chosen_levels(sizes, greatest_sizes(person.avatar.levels))
+            levels[:, number] = chosen_levels(sizes, greatest_sizes(person.avatar, float(sizes.min())))
         return levels
 
     def encode(self, time_s: float, levels: Sequence[int] | None = None) -> list[Encoded]:

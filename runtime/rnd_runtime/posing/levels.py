@@ -28,6 +28,7 @@ REACH = 2.5  # median distances to the nearest neighbour on the same side that a
 COLOUR_WEIGHT = 50.0  # of squared differences of albedo, against squared distances
 GROWTH = 0.5  # exponent: at 0 a body loses 1 % of its coverage in three levels, at 0.8 it gains 2 %
 _BITS = 10  # of a coordinate on the curve
+_NOWHERE = 1e3  # m
 _ROWS = 1024  # Gaussians whose distances to all nodes are kept at once
 
 
@@ -39,11 +40,11 @@ def on_fewer_nodes(rest: RestPose, kept: NDArray[np.int64]) -> RestPose:
     sums = [np.bincount(used, weights * values, kept.max() + 1) for values in (*each.T, np.ones(len(each)))]
     with np.errstate(divide="ignore", invalid="ignore"):
         nodes = np.stack(sums[:3], axis=1)[kept] / sums[3][kept, None]
-    nodes[~np.isfinite(nodes)] = np.inf  # no Gaussian uses it
+    nodes[~np.isfinite(nodes)] = _NOWHERE  # no Gaussian uses it
     count = min(rest.neighbours.shape[1], len(kept))
     neighbours, squares = [], []
     for part in np.array_split(points, len(points) // _ROWS + 1):
-        distances = ((part[:, None] - nodes) ** 2).sum(axis=2)
+        distances = (part**2).sum(axis=1)[:, None] + (nodes**2).sum(axis=1) - 2 * part @ nodes.T
         nearest = np.argpartition(distances, count - 1, axis=1)[:, :count]
         neighbours.append(nearest)
         squares.append(np.take_along_axis(distances, nearest, axis=1))

@@ -44,7 +44,8 @@ def test_threads_do_not_change_a_frame(tiny_avatar) -> None:
 
 def test_a_level_evaluates_the_same_networks_at_fewer_nodes(tiny_avatar) -> None:
     avatar = Avatar.load(tiny_avatar)
-    level = avatar.levels[1]
+    level = avatar.level(1)
+    assert level is not None and avatar.level(1) is level and avatar.level(0) is avatar
     assert (level.gaussians, level.nodes) == (avatar.gaussians, -(-avatar.nodes // 4))
     every, some = (each.encode(motion(body()), 0.1).values for each in (avatar, level))
     for whole, part in zip(every, some, strict=True):

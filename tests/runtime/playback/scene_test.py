@@ -144,11 +144,11 @@ def test_levels_follow_the_size_with_hysteresis():
 
 
 def test_levels_have_fewer_and_fewer_nodes_and_gaussians(avatar):
-    levels = avatar.levels
-    assert levels[0] is avatar and levels[1].gaussians == avatar.gaussians
+    sizes = greatest_sizes(avatar)
+    levels = [avatar.level(number) for number in range(len(sizes))]
+    assert avatar.level(len(sizes)) is None and levels[1].gaussians == avatar.gaussians
     assert (np.diff([level.gaussians for level in levels[1:]]) < 0).all()
     assert {level.nodes for level in levels[1:]} == {-(-avatar.nodes // 4)}
-    sizes = greatest_sizes(levels)
     assert sizes[0] == np.inf and (np.diff(sizes) < 0).all()
 
 

@@ -44,8 +44,10 @@ def bench_scenes(
         rows.append(row)
         on_row(row)
 
-    for number in range(1, len(avatar.levels)):
-        add(_switch_row(avatar, number, motion, light))
+    levels = [avatar]
+    while (level := avatar.level(len(levels))) is not None:
+        levels.append(level)
+        add(_switch_row(levels, motion, light))
     for pixels in HEIGHTS:
         add(_height_row(avatar, pixels, motion, light, repeats))
     for count, height in CROWDS.items():
@@ -62,6 +64,12 @@ def camera_of(pixels: float, azimuth: float) -> Camera:
     return Camera(side, side, K, around.world_to_camera)
 
 
+def _at(avatar: Avatar, number: int) -> Avatar:
+    level = avatar.level(number)
+    assert level is not None
+    return level
+
+
 def _frames(avatar: Avatar, pixels: float, motion: Motion, light: Light) -> list[RenderedFrame]:
     """In every one of ``VIEWS``."""
     renderer = FrameRenderer(avatar, light)
@@ -74,10 +82,10 @@ def _difference(ours: Sequence[RenderedFrame], others: Sequence[RenderedFrame]) 
     return float(np.sqrt(np.mean(squares)))
 
 
-def _switch_row(avatar: Avatar, number: int, motion: Motion, light: Light) -> dict[str, Any]:
-    """Level ``number`` at the greatest height where it is taken, against the next finer one and the whole avatar."""
-    level, finer = avatar.levels[number], avatar.levels[number - 1]
-    pixels = float(greatest_sizes(avatar.levels)[number]) * HEIGHT
+def _switch_row(levels: Sequence[Avatar], motion: Motion, light: Light) -> dict[str, Any]:
+    """The last of an avatar's levels at the greatest height where it is taken, against the finer one and the whole."""
+    avatar, finer, level = levels[0], levels[-2], levels[-1]
+    pixels = float(greatest_sizes(avatar)[len(levels) - 1]) * HEIGHT
     ours, others, whole = (_frames(each, pixels, motion, light) for each in (level, finer, avatar))
     coverage = sum(float(frame.alpha.sum()) for frame in ours) / sum(float(frame.alpha.sum()) for frame in whole)
     return {
@@ -94,7 +102,7 @@ def _switch_row(avatar: Avatar, number: int, motion: Motion, light: Light) -> di
 
 def _height_row(avatar: Avatar, pixels: int, motion: Motion, light: Light, repeats: int) -> dict[str, Any]:
     """The level that a person of ``pixels`` height gets, and the whole avatar."""
-    level = avatar.levels[chosen_levels(np.array([pixels / HEIGHT]), greatest_sizes(avatar.levels))[0]]
+    level = _at(avatar, int(chosen_levels(np.array([pixels / HEIGHT]), greatest_sizes(avatar))[0]))
     ours, whole = (_frames(each, pixels, motion, light) for each in (level, avatar))
     row = {"kind": "height", "pixels": pixels, "gaussians": level.gaussians, "rms_to_whole": _difference(ours, whole)}
     for name, each in {"": level, "whole_": avatar}.items():
@@ -141,7 +149,7 @@ def _crowd_row(
         "people": count,
         "size": list(SIZE),
         "pixels": float(np.median(camera.K[0, 0] * HEIGHT / depths)),
-        "gaussians": int(sum(avatar.levels[level].gaussians for level in levels[-1])),
+        "gaussians": int(sum(_at(avatar, level).gaussians for level in levels[-1].tolist())),
         **taken,
         "stages": {name: float(np.median(values[WARMUP:])) for name, values in stages.items()},
     }
