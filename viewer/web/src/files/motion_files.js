@@ -33,8 +33,8 @@ export function readMotionFile(bytes, name) {
   if (members.has("betas")) notes.push("the file's betas are ignored: the avatar keeps its own shape");
   checkOrder(members, frames);
   const fps = readFrameRate(members, notes), stated = readUpAxis(members), up = stated ?? (amass || easymocap ? "z" : "y");
-  if (lookLikeMillimetres(translations, frames, fps, up === "z" ? 2 : 1))
-    notes.push("trans is higher or faster than a person in metres: these look like millimetres");
+  const unit = likelyUnit(translations, frames, fps, up === "z" ? 2 : 1);
+  if (unit) notes.push(`trans is higher or faster than a person in metres: these look like ${unit}`);
   const restRoot = amass || easymocap ? smplRoot : null;
   return { name, rotations, translations, restRoot, frames, joints, jointNames, fps, up, upStated: stated !== null, notes };
 }
@@ -199,13 +199,16 @@ function readUpAxis(members) {
   return up;
 }
 
-function lookLikeMillimetres(translations, frames, fps, up) {
+/** The unit of `translations` that are not a person's in metres; "" of those that may be. */
+function likelyUnit(translations, frames, fps, up) {
   const heights = [], speeds = [];
   for (let f = 0; f < frames; f++) {
     heights.push(Math.abs(translations[3 * f + up]));
     if (f > 0) speeds.push(fps * Math.hypot(...[0, 1, 2].map((k) => translations[3 * f + k] - translations[3 * f - 3 + k])));
   }
-  return median(heights) > MAX_HEIGHT || (frames > 1 && median(speeds) > MAX_SPEED);
+  const height = median(heights);
+  if (height > MAX_HEIGHT) return height < 10 * MAX_HEIGHT ? "centimetres" : "millimetres";
+  return frames > 1 && median(speeds) > MAX_SPEED ? "millimetres or centimetres" : "";
 }
 
 function median(values) {
