@@ -5,21 +5,22 @@ import { CELL, CELLS, GAP, MAX_SLICES, REACH, SLICE } from "../constants.js";
 /** Blocked share [CELLS·CELLS·4] of the ground's light, RGB and 0, around `centre` [2] m: of `discs` [n·4] under light from `directions`
  *  [K][3] in their axes, whose `shares` [K·3] are of the whole. */
 export function skyMap(discs, centre, directions, shares) {
-  const { slices, ranges, corner, rows, width } = sliced(discs, centre[0] - REACH, centre[1] - REACH);
+  const { slices, corner, width } = sliced(discs, centre[0] - REACH, centre[1] - REACH);
   const span = CELLS + 2 * width, covered = new Float32Array(CELLS * span), blocked = new Float32Array(4 * CELLS * CELLS);
   directions.forEach(([x, y, sine], k) => {
     const stepI = -x / (sine * CELL), stepJ = -y / (sine * CELL);
     const copies = Math.floor(Math.hypot(stepI, stepJ) * SLICE / GAP) + 1;
     let top = CELLS, bottom = 0, left = span, right = 0;
-    ranges.forEach(([first, last], s) => {
-      for (let copy = 0; copy < copies && first < last; copy++) {
+    slices.forEach(({ first, last, cells }, s) => {
+      for (let copy = 0; copy < copies && cells.length; copy++) {
         const height = (s + (copy + 0.5) / copies) * SLICE;
         const shift = Math.floor(height * stepI + 0.5) + corner[0], start = Math.floor(height * stepJ + 0.5) + corner[1] + width;
         const low = Math.max(first + shift, 0), high = Math.min(last + shift, CELLS);
         if (start < 0 || start > CELLS + width || low >= high) continue;
-        for (let i = low; i < high; i++)
-          for (let at = i * span + start, from = (s * rows + i - shift) * width, end = at + width; at < end; at++, from++)
-            if (slices[from] > covered[at]) covered[at] = slices[from];
+        for (let c = 0; c < cells.length; c += 3) {
+          const i = cells[c] + shift, at = i * span + start + cells[c + 1];
+          if (i >= 0 && i < CELLS && cells[c + 2] > covered[at]) covered[at] = cells[c + 2];
+        }
         [top, bottom, left, right] = [Math.min(top, low), Math.max(bottom, high), Math.min(left, start), Math.max(right, start + width)];
       }
     });
@@ -27,6 +28,7 @@ export function skyMap(discs, centre, directions, shares) {
     for (let i = top; i < bottom; i++) {
       for (let j = Math.max(left, width); j < Math.min(right, width + CELLS); j++) {
         const here = covered[i * span + j], at = 4 * (i * CELLS + j - width);
+        if (here === 0) continue;
         blocked[at] += red * here;
         blocked[at + 1] += green * here;
         blocked[at + 2] += blue * here;
@@ -37,7 +39,7 @@ export function skyMap(discs, centre, directions, shares) {
   return blocked;
 }
 
-/** Coverage of the cells by discs: `slices` [S·rows·width], the `ranges` [S][2] of rows in use, and the `corner` in the map. */
+/** Cells that discs cover, by slice: `cells` [n·3] row, column and share, rows from `first` to before `last`; their `corner` in the map. */
 function sliced(discs, i0, j0) {
   const inside = [], slice = (height) => Math.min(Math.floor(height / SLICE), MAX_SLICES - 1);
   let lowI = CELLS, lowJ = CELLS, highI = 0, highJ = 0, count = 0;
@@ -49,16 +51,19 @@ function sliced(discs, i0, j0) {
     count = Math.max(count, slice(discs[k + 2]) + 1);
   }
   const corner = [lowI - 2, lowJ - 2], rows = Math.max(highI - lowI + 5, 0), width = Math.max(highJ - lowJ + 5, 1);
-  const slices = new Float32Array(count * rows * width), ranges = Array.from({ length: count }, () => [rows, 0]);
+  const shares = Array.from({ length: count }, () => new Float32Array(rows * width));
   for (const [a, b, s, reach] of inside) {
     const i = Math.floor(a) - corner[0], j = Math.floor(b) - corner[1];
     for (let row = i - 1; row <= i + 1; row++)
       for (let column = j - 1; column <= j + 1; column++) {
-        const at = (s * rows + row) * width + column;
-        const share = Math.min(reach - Math.hypot(row + 0.5 + corner[0] - a, column + 0.5 + corner[1] - b), 1);
-        if (share > slices[at]) slices[at] = share;
+        const x = row + 0.5 + corner[0] - a, y = column + 0.5 + corner[1] - b, at = row * width + column;
+        shares[s][at] = Math.max(shares[s][at], Math.min(reach - Math.sqrt(x * x + y * y), 1));
       }
-    ranges[s] = [Math.min(ranges[s][0], i - 1), Math.max(ranges[s][1], i + 2)];
   }
-  return { slices, ranges, corner, rows, width };
+  const slices = shares.map((slice) => {
+    const cells = [];
+    slice.forEach((share, at) => { if (share > 0) cells.push(Math.floor(at / width), at % width, share); });
+    return { first: cells[0], last: cells.at(-3) + 1, cells: Float32Array.from(cells) };
+  });
+  return { slices, corner, width };
 }

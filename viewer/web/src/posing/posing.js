@@ -8,7 +8,7 @@ const TERMS = 14, SUM = 12, GREATEST = 13;  // of a node's blend: Σ_j e^(Δ_j �
 // Scratch of one Gaussian
 const between = new Float64Array(TERMS), blend = new Float64Array(12), moved = new Float64Array(6);
 const a = new Float64Array(9), cofactors = new Float64Array(9), rotation = new Float64Array(9), f = new Float64Array(9);
-const widen = new Float64Array(9);
+const widen = new Float64Array(9), turned = new Float64Array(3);
 
 /** Dot product of row `at` of a 3×3 `m` and (x, y, z). */
 const row = (m, at, x, y, z) => m[at] * x + m[at + 1] * y + m[at + 2] * z;
@@ -60,7 +60,8 @@ export class RestPose {
       this.#between(visibility, terms, i, coefficients, SH_COUNT * i);
       const limb = 7 * i, u = limbs[limb], v = limbs[limb + 1], w = limbs[limb + 2], kappa = limbs[limb + 6] * widening(u, v, w);
 
-      const p = 3 * i, [x, y, z] = [0, 1, 2].map((k) => points[p + k] + maxOffset * moved[k] + kappa * limbs[limb + 3 + k]);
+      const p = 3 * i, x = points[p] + maxOffset * moved[0] + kappa * limbs[limb + 3];
+      const y = points[p + 1] + maxOffset * moved[1] + kappa * limbs[limb + 4], z = points[p + 2] + maxOffset * moved[2] + kappa * limbs[limb + 5];
       for (let k = 0; k < 3; k++) means[p + k] = row(a, 3 * k, x, y, z) + blend[4 * k + 3];
 
       quaternionToMatrix(moved[3] / 2, moved[4] / 2, moved[5] / 2);
@@ -74,9 +75,9 @@ export class RestPose {
 
       const along = kappa * (u * rest[p] + v * rest[p + 1] + w * rest[p + 2]);
       const nx = rest[p] + u * along, ny = rest[p + 1] + v * along, nz = rest[p + 2] + w * along;
-      const n = [0, 3, 6].map((k) => row(cofactors, k, nx, ny, nz) + fallback * row(a, k, nx, ny, nz));
-      const length = Math.max(Math.hypot(...n), SHORTEST);
-      for (let k = 0; k < 3; k++) normals[p + k] = n[k] / length;
+      for (let k = 0; k < 3; k++) turned[k] = row(cofactors, 3 * k, nx, ny, nz) + fallback * row(a, 3 * k, nx, ny, nz);
+      const length = Math.max(Math.sqrt(turned[0] * turned[0] + turned[1] * turned[1] + turned[2] * turned[2]), SHORTEST);
+      for (let k = 0; k < 3; k++) normals[p + k] = turned[k] / length;
     }
     return this.posed;
   }
@@ -84,10 +85,10 @@ export class RestPose {
   /** `fields` [M·width] interpolated for Gaussian i, to `out` from `at` on. */
   #between(fields, width, i, out, at) {
     const { neighbours, weights } = this, own = neighbours.length / this.count;
-    for (let j = 0; j < width; j++) {
-      let sum = 0;
-      for (let near = own * i; near < own * (i + 1); near++) sum += weights[near] * fields[width * neighbours[near] + j];
-      out[at + j] = sum;
+    for (let j = 0; j < width; j++) out[at + j] = 0;
+    for (let near = own * i; near < own * (i + 1); near++) {
+      const weight = weights[near], from = width * neighbours[near];
+      for (let j = 0; j < width; j++) out[at + j] += weight * fields[from + j];
     }
   }
 
