@@ -6,6 +6,8 @@ import numpy as np
 
 from rnd_bench.cli import main
 from rnd_bench.speed import scenes
+from rnd_bench.speed.roofline import network_flops
+from rnd_runtime.avatar.avatar import Avatar
 from support.paths import ASSETS
 
 
@@ -17,7 +19,7 @@ def test_rows_of_levels_and_crowds(tmp_path, monkeypatch):
     words = ["--avatar", ASSETS / "avatar.onnx", "--motion", ASSETS / "walk.npz", "--hdr", ASSETS / "sky.exr"]
     assert main(["scenes", *map(str, words), "--json", str(tmp_path / "rows.json"), "--repeats", "2"]) == 0
     rows = json.loads((tmp_path / "rows.json").read_text())
-    by_kind = {kind: [row for row in rows if row["kind"] == kind] for kind in ("switch", "height", "crowd")}
+    by_kind = {kind: [row for row in rows if row["kind"] == kind] for kind in ("switch", "height", "crowd", "roofline")}
     counts = [row["gaussians"] for row in by_kind["switch"]]
     assert counts == sorted(counts, reverse=True) and counts[0] == 12000 > counts[1] and counts[-1] <= 2000
     large, small = by_kind["height"]
@@ -26,6 +28,16 @@ def test_rows_of_levels_and_crowds(tmp_path, monkeypatch):
     one, three = by_kind["crowd"]
     assert one["gaussians"] == 12000 and three["people"] == 3 and three["ms_median"] > 0 and three["cpu_ms_median"] > 0
     assert {"encoders", "posing", "shading", "raster"} <= set(three["stages"])
+    bounds = {row["stage"]: row for row in by_kind["roofline"] if row["people"] == 3}
+    assert {"encoders", "posing", "shading", "projection", "sort", "raster"} == set(bounds)
+    assert all(0 < row["ms_least"] < row["ms"] for row in bounds.values())
+
+
+def test_the_networks_operations_are_those_of_their_nodes():
+    avatar = Avatar.load(ASSETS / "avatar.onnx")
+    whole, quarter = (network_flops(each) for each in (avatar, avatar.level(1)))
+    last_layers = 2 * avatar.nodes * 64 * (24 + 6 + 16)
+    assert whole > last_layers and 0.25 < quarter / whole < 0.4  # attention between joints does not shrink
 
 
 def test_a_camera_shows_a_person_of_so_many_pixels():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter, process_time
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from rnd_bench.speed.frame import STEP_S, STEP_YAW, WARMUP, summary
+from rnd_bench.speed.roofline import machine_limits, roofline_rows
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.motion.motion import Motion, load_motion
@@ -35,7 +36,7 @@ APART = 1.2  # m between neighbours of a crowd
 def bench_scenes(
     avatar_file: Path, motion_file: Path, light_file: Path, repeats: int, on_row: Callable[[dict[str, Any]], None]
 ) -> list[dict[str, Any]]:
-    """Rows of ``kind`` "switch" (of neighbouring levels), "height" and "crowd", as they are measured."""
+    """Rows of ``kind`` "switch" (of neighbouring levels), "height", "limits", "crowd" and "roofline", as measured."""
     avatar = Avatar.load(avatar_file)
     motion, light = load_motion(motion_file, avatar.skeleton), load_light(light_file)
     rows = []
@@ -50,8 +51,11 @@ def bench_scenes(
         add(_switch_row(levels, motion, light))
     for pixels in HEIGHTS:
         add(_height_row(avatar, pixels, motion, light, repeats))
+    limits = machine_limits()
+    add({"kind": "limits", **limits})
     for count, height in CROWDS.items():
-        add(_crowd_row(avatar, count, height, motion, light, repeats))
+        for row in _crowd_rows(avatar, count, height, motion, light, repeats, limits):
+            add(row)
     return rows
 
 
@@ -116,10 +120,16 @@ def _height_row(avatar: Avatar, pixels: int, motion: Motion, light: Light, repea
     return row
 
 
-def _crowd_row(
-    avatar: Avatar, count: int, pixels: float | None, motion: Motion, light: Light, repeats: int
-) -> dict[str, Any]:
-    """``count`` people on a grid, all in view; motion and light change from frame to frame."""
+def _crowd_rows(
+    avatar: Avatar,
+    count: int,
+    pixels: float | None,
+    motion: Motion,
+    light: Light,
+    repeats: int,
+    limits: Mapping[str, float],
+) -> list[dict[str, Any]]:
+    """``count`` people on a grid, all in view; motion and light change from frame to frame. Then its ``roofline``."""
     columns = int(np.ceil(np.sqrt(2 * count)))
     spots = [(APART * (k % columns), -APART * (k // columns)) for k in range(count)]
     people = [Person(avatar, motion, -0.17 * k, place_at(*spot, 0.7 * k)) for k, spot in enumerate(spots)]
@@ -144,15 +154,19 @@ def _crowd_row(
     taken = _timed(draw, repeats)
     camera = path(0, 0.0)
     depths = np.array([(camera.world_to_camera @ [*person.positions(np.zeros(1))[0], 1])[2] for person in people])
-    return {
+    medians = {name: float(np.median(values[WARMUP:])) for name, values in stages.items()}
+    crowd = {
         "kind": "crowd",
         "people": count,
         "size": list(SIZE),
         "pixels": float(np.median(camera.K[0, 0] * HEIGHT / depths)),
         "gaussians": int(sum(_at(avatar, level).gaussians for level in levels[-1].tolist())),
         **taken,
-        "stages": {name: float(np.median(values[WARMUP:])) for name, values in stages.items()},
+        "stages": medians,
     }
+    bodies = scene.encode(0.0, levels[0].tolist())
+    roofline = roofline_rows(bodies, camera, medians, limits)
+    return [crowd, *({"kind": "roofline", "people": count, **row} for row in roofline)]
 
 
 def _timed(draw: Callable[[int], None], repeats: int) -> dict[str, float]:
