@@ -12,6 +12,7 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.playback.frame import FrameRenderer, draw_gaussians
 from rnd_runtime.playback.rasterizer import make_rasterizer
+from rnd_runtime.playback.scene import Person, SceneRenderer, place_at
 from rnd_runtime.raster.tone import tone_map
 from rnd_runtime.shading.shader import Shader
 from support.shading_scenes import ball
@@ -142,3 +143,17 @@ def test_wrong_shapes_are_refused(avatar, motion, sky, rasterizer):
     gaussians = avatar.pose(motion, 0.3)
     with pytest.raises(InputError, match="covariances: expected shape"):
         draw_gaussians(replace(gaussians, covariances=gaussians.covariances[:, :5]), Shader(sky), CAMERA, rasterizer)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_scene_of_far_people_has_their_levels_and_the_cpus_picture(avatar, motion, sky, backend):
+    people = [Person(avatar, motion, 0.2 * k, place_at(1.2 * k, -k, 0)) for k in range(2)]
+    camera = Camera.look_at([0, 1.2, 30], [0.6, 1, 0], width=96, height=64, fov_y=0.2)
+    frames = []
+    for raster in ("cpu", backend):
+        with FrameRenderer(avatar, sky, camera, raster=raster) as renderer:
+            scene = SceneRenderer(people, renderer)
+            levels = scene.levels(1, 30.0, lambda frame, time: camera, start=0.4)[0].tolist()
+            frames.append(scene.draw(scene.encode(0.4, levels), camera))
+        assert min(levels) > 0
+    _assert_same_picture(frames[1].srgb, frames[0].srgb)
