@@ -561,6 +561,21 @@ def _clip(page: Page, folder: Path, size: int) -> Path:
     return files[0]
 
 
+def test_a_picture_has_twice_the_pixels_or_the_most(loaded):
+    loaded.run("""(() => {
+        window.makeUrl = URL.createObjectURL;
+        URL.createObjectURL = (blob) => { window.saved = blob; return "data:,"; };
+        document.getElementById("picture").value = "png 2";
+    })()""")
+    for width, height, size in ((600, 500, [1200, 1000]), (1024, 64, [2048, 128]), (2048, 64, [2048, 64])):
+        loaded.run(f"Object.assign(rnd.state, {{ width: {width}, height: {height} }}); window.saved = null")
+        loaded.run("document.getElementById('screenshot').click()")
+        loaded.wait("saved")
+        assert loaded.run("createImageBitmap(saved).then(({ width, height }) => [width, height])") == size
+    assert loaded.run("document.getElementById('message').textContent").startswith("saved with 2048 × 64 pixels")
+    loaded.run("URL.createObjectURL = makeUrl; 1")
+
+
 def test_the_clip_is_a_download(loaded, tmp_path):
     file = _clip(loaded, tmp_path, 128)
     assert file.suffix in (".webm", ".mp4") and file.stat().st_size > 5_000

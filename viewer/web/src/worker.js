@@ -16,7 +16,7 @@ import { shBasis } from "./shading/sh.js";
 import { makeShader } from "./shading/shader.js";
 import { Splatter } from "./raster/splat.js";
 
-const SIZE = [512, 512], SIZES = [64, 1024];  // px: default, least and largest
+const SIZE = [512, 512], SIZES = [64, 1024], PICTURE = 2048;  // px: default, least and largest; of a saved image
 
 // of a camera that sees no ground
 const NO_SHADOW = Object.fromEntries(["ground", "sun0", "sun1"].map((name) => [`to_${name}`, new Float32Array(9)]));
@@ -74,7 +74,7 @@ function description({ avatar, motion, lights }, light) {
     avatar: avatar.name, gaussians: avatar.gaussians, parents: avatar.skeleton.parents,
     motion: { name: motion.name, duration: motion.duration, fps: motion.fps },
     lights: lights.map(({ name }) => name), light,
-    head: avatar.skeleton.names.indexOf("head"), fit: true, size: SIZE, sizes: SIZES, raster: splatter.name, view: homeView(avatar.skeleton, motion),
+    head: avatar.skeleton.names.indexOf("head"), fit: true, size: SIZE, sizes: SIZES, picture: PICTURE, raster: splatter.name, view: homeView(avatar.skeleton, motion),
     truths: [], ground: true, notes: motion.notes,
   };
 }

@@ -267,7 +267,7 @@ function frame(exact = true) {
 
 async function screenshot() {
   const truth = state.truth === null ? null : scene.truths[state.truth].label.replaceAll(/[^\p{L}\p{N}._-]+/gu, "_");
-  const [kind, times] = $("picture").value.split(" "), [least, most] = scene.sizes, { width, height } = state;
+  const [kind, times] = $("picture").value.split(" "), [least, largest] = scene.sizes, most = scene.picture ?? largest, { width, height } = state;
   const name = `avatar_${truth ?? `${state.time.toFixed(2)}s`}.${kind}`, grown = Math.min(times, most / Math.max(width, height));
   Object.assign(state, { width: Math.max(Math.round(grown * width), least), height: Math.max(Math.round(grown * height), least) });
   const drawn = frame().catch(() => null);
@@ -278,6 +278,7 @@ async function screenshot() {
   canvas.getContext("2d").drawImage($("frame"), 0, 0);
   canvas.getContext("2d").drawImage($("overlay"), 0, 0, canvas.width, canvas.height);
   canvas.toBlob((blob) => download(blob, name), `image/${kind}`, PICTURE_QUALITY);
+  if (grown < times) say(`saved with ${canvas.width} × ${canvas.height} pixels, the most here; rnd-play --size makes larger ones`, { seconds: 4 });
   if (times > 1) redraw();
 }
 
