@@ -19,16 +19,15 @@ def test_rows_of_levels_and_crowds(tmp_path, monkeypatch):
     words = ["--avatar", ASSETS / "avatar.onnx", "--motion", ASSETS / "walk.npz", "--hdr", ASSETS / "sky.exr"]
     assert main(["scenes", *map(str, words), "--json", str(tmp_path / "rows.json"), "--repeats", "2"]) == 0
     rows = json.loads((tmp_path / "rows.json").read_text())
-    by_kind = {kind: [row for row in rows if row["kind"] == kind] for kind in ("switch", "height", "crowd", "roofline")}
-    counts = [row["gaussians"] for row in by_kind["switch"]]
+    counts = [row["gaussians"] for row in rows["switches"]]
     assert counts == sorted(counts, reverse=True) and counts[0] == 12000 > counts[1] and counts[-1] <= 2000
-    large, small = by_kind["height"]
+    large, small = rows["heights"]
     assert large["gaussians"] == 12000 and 0 < large["rms_to_whole"] < 1  # fewer nodes
     assert small["gaussians"] < 4000 and 0 < small["rms_to_whole"] < 4
-    one, three = by_kind["crowd"]
+    one, three = rows["crowds"]
     assert one["gaussians"] == 12000 and three["people"] == 3 and three["ms_median"] > 0 and three["cpu_ms_median"] > 0
     assert {"encoders", "posing", "shading", "raster"} <= set(three["stages"])
-    bounds = {row["stage"]: row for row in by_kind["roofline"] if row["people"] == 3}
+    bounds = {row["stage"]: row for row in rows["roofline"] if row["people"] == 3}
     assert {"encoders", "posing", "shading", "projection", "sort", "raster"} == set(bounds)
     assert all(0 < row["ms_least"] < row["ms"] for row in bounds.values())
 

@@ -118,13 +118,13 @@ def run_scenes(options: Scenes) -> None:
     threads = _threads(options.threads)
     set_threads(threads)
     about = {"avatar_sha256": sha256_of(options.avatar), "machine": machine(), "threads": threads}
-    rows: list[dict[str, Any]] = []
+    rows: dict[str, list[dict[str, Any]]] = {}
 
-    def on_row(row: dict[str, Any]) -> None:
-        rows.append(row | about)
+    def on_row(kind: str, row: dict[str, Any]) -> None:
+        rows.setdefault(kind, []).append(row | about)
         _write(options.json, rows)
         numbers = {name: value for name, value in row.items() if isinstance(value, int | float)}
-        show(f"{row['kind']:7}" + "  ".join(f"{name} {value:.4g}" for name, value in numbers.items()))
+        show(f"{kind:9}" + "  ".join(f"{name} {value:.4g}" for name, value in numbers.items()))
 
     bench_scenes(avatar, motion, light, options.repeats, on_row)
 

@@ -34,29 +34,25 @@ APART = 1.2  # m between neighbours of a crowd
 
 
 def bench_scenes(
-    avatar_file: Path, motion_file: Path, light_file: Path, repeats: int, on_row: Callable[[dict[str, Any]], None]
-) -> list[dict[str, Any]]:
-    """Rows of ``kind`` "switch" (of neighbouring levels), "height", "limits", "crowd" and "roofline", as measured."""
+    avatar_file: Path, motion_file: Path, light_file: Path, repeats: int, on_row: Callable[[str, dict[str, Any]], None]
+) -> None:
+    """Call ``on_row`` with the kind and the row of each switch of neighbouring levels, each height, the machine's
+    limits, and each crowd and its stages against these limits."""
     avatar = Avatar.load(avatar_file)
     motion, light = load_motion(motion_file, avatar.skeleton), load_light(light_file)
-    rows = []
-
-    def add(row: dict[str, Any]) -> None:
-        rows.append(row)
-        on_row(row)
-
     levels = [avatar]
     while (level := avatar.level(len(levels))) is not None:
         levels.append(level)
-        add(_switch_row(levels, motion, light))
+        on_row("switches", _switch_row(levels, motion, light))
     for pixels in HEIGHTS:
-        add(_height_row(avatar, pixels, motion, light, repeats))
+        on_row("heights", _height_row(avatar, pixels, motion, light, repeats))
     limits = machine_limits()
-    add({"kind": "limits", **limits})
+    on_row("limits", limits)
     for count, height in CROWDS.items():
-        for row in _crowd_rows(avatar, count, height, motion, light, repeats, limits):
-            add(row)
-    return rows
+        crowd, *stages = _crowd_rows(avatar, count, height, motion, light, repeats, limits)
+        on_row("crowds", crowd)
+        for row in stages:
+            on_row("roofline", row)
 
 
 def camera_of(pixels: float, azimuth: float) -> Camera:
@@ -93,7 +89,6 @@ def _switch_row(levels: Sequence[Avatar], motion: Motion, light: Light) -> dict[
     ours, others, whole = (_frames(each, pixels, motion, light) for each in (level, finer, avatar))
     coverage = sum(float(frame.alpha.sum()) for frame in ours) / sum(float(frame.alpha.sum()) for frame in whole)
     return {
-        "kind": "switch",
         "gaussians": level.gaussians,
         "nodes": level.nodes,
         "of": avatar.gaussians,
@@ -108,7 +103,7 @@ def _height_row(avatar: Avatar, pixels: int, motion: Motion, light: Light, repea
     """The level that a person of ``pixels`` height gets, and the whole avatar."""
     level = _at(avatar, int(chosen_levels(np.array([pixels / HEIGHT]), greatest_sizes(avatar))[0]))
     ours, whole = (_frames(each, pixels, motion, light) for each in (level, avatar))
-    row = {"kind": "height", "pixels": pixels, "gaussians": level.gaussians, "rms_to_whole": _difference(ours, whole)}
+    row = {"pixels": pixels, "gaussians": level.gaussians, "rms_to_whole": _difference(ours, whole)}
     for name, each in {"": level, "whole_": avatar}.items():
         renderer = FrameRenderer(each, light)
 
@@ -156,7 +151,6 @@ def _crowd_rows(
     depths = np.array([(camera.world_to_camera @ [*person.positions(np.zeros(1))[0], 1])[2] for person in people])
     medians = {name: float(np.median(values[WARMUP:])) for name, values in stages.items()}
     crowd = {
-        "kind": "crowd",
         "people": count,
         "size": list(SIZE),
         "pixels": float(np.median(camera.K[0, 0] * HEIGHT / depths)),
@@ -166,7 +160,7 @@ def _crowd_rows(
     }
     bodies = scene.encode(0.0, levels[0].tolist())
     roofline = roofline_rows(bodies, camera, medians, limits)
-    return [crowd, *({"kind": "roofline", "people": count, **row} for row in roofline)]
+    return [crowd, *({"people": count, **row} for row in roofline)]
 
 
 def _timed(draw: Callable[[int], None], repeats: int) -> dict[str, float]:
