@@ -13,6 +13,7 @@ import msgspec
 from rich.console import Console
 from rich.table import Table
 
+from rnd_bench.lifter.pose2sim import SCORED
 from rnd_runtime.capture.capture import Capture, load_capture
 from rnd_runtime.capture.format import Split
 from rnd_runtime.cli.progress import Progress
@@ -40,7 +41,7 @@ METHODS = (
     next(row for row in VARIANTS if row.name == "LBS, plain colour"),
 )
 EXACT = StudyRow("exact poses", "the true poses instead of estimated ones", "ours")
-WHAM = StudyRow("WHAM-like noise", "added to the estimated poses, none refined", "ours")
+WHAM = StudyRow("WHAM-like noise", "on the estimated poses, none refined; of one camera", "ours")
 ROWS = "rows.json"  # in the folder of a run
 
 
@@ -75,8 +76,8 @@ def run(options: Filmed) -> None:
     rows: list[dict[str, Any]] = []
     with Progress() as progress:
         for film in _films(options, out, progress):
-            methods = [*METHODS, EXACT if film.exact else WHAM]
-            for method in chosen(methods, options.methods):
+            compared = (EXACT,) if film.exact else (WHAM,) if film.name == SCORED[0] else ()
+            for method in chosen((*METHODS, *compared), options.methods):
                 progress.phase(f"{film.name}: {method.name}", 1)
                 rows += _rows(film, method, config, out, (perceptual, judge), progress.update)
     if options.json is not None:
