@@ -35,16 +35,17 @@ def _assert_same(got: Camera, wanted: Camera) -> None:
     np.testing.assert_allclose(got.K, wanted.K, atol=1e-2)
 
 
+@pytest.mark.parametrize("digits", ["03d", "d"])
 @pytest.mark.parametrize("shared", [True, False])
-def test_transforms_of_nerfstudio(shared, tmp_path):
+def test_transforms_of_nerfstudio(shared, digits, tmp_path):
     """Camera-to-world in OpenGL's axes in a Z-up world; intrinsics for all frames or for each."""
-    wanted = [_camera((k, 2, 4), 0.7 if shared else 0.5 + 0.1 * k) for k in range(3)]
+    wanted = [_camera((k, 2, 4), 0.7 if shared else 0.5 + 0.1 * k) for k in range(11)]
     lenses = [
         {"fl_x": c.K[0, 0], "fl_y": c.K[1, 1], "cx": c.K[0, 2], "cy": c.K[1, 2], "w": 640, "h": 360} for c in wanted
     ]
     frames = [
         {
-            "file_path": f"images/{k:03d}.png",
+            "file_path": f"images/{k:{digits}}.png",
             "transform_matrix": (Z_UP @ np.linalg.inv(c.world_to_camera) @ GL).tolist(),
         }
         for k, c in enumerate(wanted)
@@ -54,7 +55,7 @@ def test_transforms_of_nerfstudio(shared, tmp_path):
         document = {"frames": [{**frame, **lens} for frame, lens in zip(frames, lenses)][::-1]}
     (tmp_path / "transforms.json").write_text(json.dumps(document))
     got = _converted(tmp_path / "transforms.json", tmp_path / "out.json")
-    assert len(got) == 3
+    assert len(got) == 11
     for ours, theirs in zip(got, wanted):
         _assert_same(ours, theirs)
 
@@ -120,6 +121,15 @@ def test_an_animated_camera_of_gltf(tmp_path):
     for ours, theirs in zip(got, wanted):
         _assert_same(ours, theirs)
     assert len(_converted(tmp_path / "a.glb", tmp_path / "twice.json", "--size", "640x360", "--fps", "48")) == 7
+
+
+@pytest.mark.parametrize(("size", "shown"), [("640x640", (640, 360)), ("720x360", (640, 360)), ("320x180", (320, 180))])
+def test_a_camera_of_gltf_is_not_stretched_to_other_sizes(tmp_path, size, shown):
+    """An image of another aspect has square pixels and holds all that the camera sees."""
+    _glb(tmp_path / "a.glb", np.zeros(1), [_camera()])
+    (camera,) = _converted(tmp_path / "a.glb", tmp_path / "out.json", "--size", size)
+    np.testing.assert_allclose(camera.K[[0, 1], [0, 1]], 0.5 * shown[1] / math.tan(0.35))
+    np.testing.assert_allclose(camera.K[:2, 2], [camera.width / 2, camera.height / 2])
 
 
 def test_a_camera_of_usd_whatever_its_axes_and_unit(tmp_path):

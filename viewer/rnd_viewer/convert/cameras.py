@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -116,8 +117,13 @@ def _of_transforms(document: Mapping[str, Any], size: tuple[int, int]) -> list[C
         raise InputError("frames of the camera file", expected="a list of objects", got="others")
     if not frames:
         raise InputError("camera file holds no camera")
-    frames = sorted(frames, key=lambda frame: str(frame.get("file_path", "")))
+    frames = sorted(frames, key=lambda frame: _by_numbers(str(frame.get("file_path", ""))))
     return [_of_entry({**document, **frame}, size) for frame in frames]
+
+
+def _by_numbers(name: str) -> list[tuple[int, str]]:
+    """A key that sorts "2.png" before "10.png"."""
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", name)]
 
 
 def _of_entry(entry: Mapping[str, Any], size: tuple[int, int]) -> Camera:
@@ -157,9 +163,9 @@ def _of_gltf(file: Path, name: str | None, size: tuple[int, int], fps: float) ->
         raise InputError("camera", expected="perspective", got=lens["type"])
     width, height = size
     aspect = float(lens["perspective"].get("aspectRatio", width / height))
-    fy = 0.5 * height / math.tan(0.5 * float(lens["perspective"]["yfov"]))
-    fx = fy * (width / height) / aspect
-    K = _intrinsics(fx, fy, width / 2, height / 2)
+    high = 0.5 * min(height, width / aspect)  # square pixels, and all that the camera sees is in the image
+    focal = high / math.tan(0.5 * float(lens["perspective"]["yfov"]))
+    K = _intrinsics(focal, focal, width / 2, height / 2)
     parents = {child: index for index, node in enumerate(nodes) for child in node.get("children", [])}
     chain = [chosen]
     while chain[-1] in parents:
