@@ -80,6 +80,15 @@ def test_of_whams_repeated_frames_the_first_counts_as_for_rnd_data_import(tmp_pa
         load_motion(write_pickle(file, {3: track}), SKELETON)
 
 
+@pytest.mark.parametrize("number", [np.nan, 2**63, 2.0**70, "0001.jpg"])
+def test_frame_numbers_that_are_none_are_refused(tmp_path, number):
+    file = write_wham(tmp_path)
+    track = pickle.loads(file.read_bytes())[3]
+    track["frame_ids"] = [*track["frame_ids"][:-1], number]
+    with pytest.raises(InputError, match=r"wham_output.pkl: frame numbers: expected whole numbers below 1e\+15, got"):
+        load_motion(write_pickle(file, {3: track}), SKELETON)
+
+
 @pytest.mark.parametrize("write", [write_phalp, write_wham_in_camera, write_tram])
 def test_what_a_camera_saw_is_turned_upright_over_the_origin(tmp_path, write):
     motion = load_motion(write(tmp_path), SKELETON)

@@ -19,6 +19,7 @@ Floats = NDArray[np.float64]
 PHALP_FOCAL = 5000 / 256
 """of the image's longer side: EXTRA.FOCAL_LENGTH / render.res"""
 
+_MAX_NUMBER = 1e15  # of a frame: whole as a float, too
 _HAND_COEFFICIENTS = {78: "SMPL", 87: "SMPL-X"}
 """columns of EasyMocap's SMPL-H and SMPL-X poses: 22 joints, then coefficients of hands and face"""
 
@@ -144,9 +145,9 @@ def in_order(frames: ArrayLike, *values: ArrayLike) -> tuple[NDArray[np.int64], 
     """A track's ascending frame numbers [F] and its ``values`` [F, …]; the first of repeated numbers.
 
     Raises:
-        InputError: their lengths differ.
+        InputError: their lengths differ, or frames have no numbers.
     """
-    numbers = np.asarray(frames, np.int64).reshape(-1)
+    numbers = _frame_numbers(frames)
     arrays = [np.asarray(value, np.float64) for value in values]
     for array in arrays:
         if array.shape[:1] != numbers.shape:
@@ -156,9 +157,21 @@ def in_order(frames: ArrayLike, *values: ArrayLike) -> tuple[NDArray[np.int64], 
     return ascending, [array[first] for array in arrays]
 
 
+def _frame_numbers(frames: ArrayLike) -> NDArray[np.int64]:
+    """``frames`` [F] as whole numbers."""
+    try:
+        numbers = np.asarray(frames, np.float64).reshape(-1)
+        if (np.abs(numbers) < _MAX_NUMBER).all():  # nor NaN
+            return np.asarray(frames).reshape(-1).astype(np.int64)
+    except (TypeError, ValueError, OverflowError):
+        numbers = np.zeros(0)
+    got = f"{np.abs(numbers).max():g}" if numbers.size else "others"
+    raise InputError("frame numbers", expected=f"whole numbers below {_MAX_NUMBER:g}", got=got)
+
+
 def order_notes(frames: ArrayLike) -> tuple[str, ...]:
     """A note where a track's frame numbers are not ``in_order``."""
-    back = np.flatnonzero(np.diff(np.asarray(frames, np.int64).reshape(-1)) <= 0)
+    back = np.flatnonzero(np.diff(_frame_numbers(frames)) <= 0)
     return ("frame numbers are out of order: sorted; of repeated ones the first counts",) if len(back) else ()
 
 
