@@ -42,6 +42,9 @@ LEVEL_SPACING, NODE_SPACING = 0.35, 24.0
 by 1/255 at most, as root mean square over the body's box (``rnd-bench scenes``)"""
 HYSTERESIS = 1.15
 """factor on the distance between taking a coarser level and giving it back"""
+SIDE_BY_SIDE = 0.6
+"""m between people across the view at which none hides another"""
+_TURNS = np.radians([0, 10, -10, 20, -20, 30, -30, 40, -40]).tolist()
 MAX_SHADOW_RESOLUTION = 4096
 """texels along a depth map of several bodies: 20 m as fine as for one"""
 
@@ -86,13 +89,21 @@ def place_at(x: float, z: float, heading: float) -> Floats:
 
 
 def frame_people(people: Sequence[Person]) -> Framing:
-    """The ``Framing`` of all motions; it faces as the first person does."""
+    """The ``Framing`` of all motions; it faces as the first person does, or turned so that people are side by side."""
     framings = [frame_motion(person.avatar.skeleton, person.motion) for person in people]
     places = [person.place for person in people]
     joints = np.concatenate([each.joints @ at[:3, :3].T + at[:3, 3] for each, at in zip(framings, places)])
     facing = framings[0].facing + float(np.arctan2(places[0][0, 2], places[0][2, 2]))
+    middles = np.array([at[:3, :3] @ each.centre + at[:3, 3] for each, at in zip(framings, places)])
+    facing += max(_TURNS, key=lambda turn: (_least_gap(middles, facing + turn), -abs(turn)))
     padding = max(each.padding for each in framings)
     return Framing(joints, (joints.min(axis=0) + joints.max(axis=0)) / 2, padding, facing)
+
+
+def _least_gap(places: Floats, facing: float) -> float:
+    """Least distance m, at most ``SIDE_BY_SIDE``, of two of ``places`` [N, 3] across a view from ``facing``."""
+    across = np.sort(places @ [np.cos(facing), 0, -np.sin(facing)])
+    return min(float(np.diff(across).min(initial=np.inf)), SIDE_BY_SIDE)
 
 
 def ground_under(people: Sequence[Person]) -> Plane:

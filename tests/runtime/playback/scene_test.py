@@ -135,6 +135,15 @@ def test_a_heading_turns_to_the_left_and_the_camera_sees_everybody(avatar, motio
     assert there.frames_at(10) == here.frames_at(10) + 10
 
 
+def test_nobody_hides_another_in_the_default_view(avatar, motion):
+    """Who stands behind the first is shown beside him; who stands aside turns nothing."""
+    first, behind, aside = (Person(avatar, motion, 0, place_at(x, z, 0)) for x, z in ((0, 0), (0, -2), (1.2, -2)))
+    straight = frame_people([first]).facing
+    assert frame_people([first, aside]).facing == straight
+    turned = frame_people([first, behind]).facing - straight
+    assert 0.25 < abs(turned) < 0.4 and 2 * np.sin(abs(turned)) > 0.6
+
+
 def test_levels_follow_the_size_with_hysteresis():
     at = np.array([np.inf, 50.0, 25.0])  # px per metre up to which each is taken
     sizes = np.array(
