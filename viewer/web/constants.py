@@ -26,7 +26,7 @@ SHARED = {
     "rnd_runtime.motion.smpl": "NAMES_BY_COUNT SMPL_REST_ROOT SMPLX_REST_ROOT",
     "rnd_runtime.motion.readers.arrays": (
         "_ORTHOGONAL _AMASS_MEMBERS _MAX_ANGLE _MANY_BEYOND_A_TURN _MAX_DISTANCE _MAX_HEIGHT _MAX_SPEED _ORDERS"
-        " _DEFAULT_FPS FPS_LIMITS"
+        " _TIMES _FPS_OF_TIMES _UNEVEN _DEFAULT_FPS FPS_LIMITS"
     ),
     "rnd_runtime.motion.motion": "STAND_INS",
     "rnd_runtime.motion.standing": "UP_ROTATIONS _UNCLEAR _CLEAR _LEG _LIES _STANDS _SHARE",

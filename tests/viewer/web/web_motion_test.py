@@ -247,6 +247,18 @@ LAYOUTS: dict[str, dict[str, object]] = {
     "named parts": {"pose_body": _poses(63), "joint_names": list(_skeleton().names[1:22]), "mocap_frame_rate": 30},
     "still": {"poses": _poses(72)},
     "Python beside": {"poses": _poses(72), "trans": TRANS, "info": np.array([{"a": 1}, None])},
+    "times": {"poses": _poses(72), "trans": TRANS, "times": 2 + np.arange(FRAMES) / 24},
+    "uneven times": {
+        "poses": _poses(72),
+        "trans": TRANS,
+        "timestamps": np.arange(FRAMES) / 24 + 2 * (np.arange(FRAMES) > 2),
+    },
+    "times that are none": {
+        "poses": _poses(72),
+        "trans": TRANS,
+        "times": np.arange(FRAMES),
+        "timestamps": ["a"] * FRAMES,
+    },
     "degrees": {"poses": _poses(72) * 30, "trans": TRANS, "fps": 30},
     "matrices": {"poses": axis_angle_to_matrix(_poses(72).reshape(FRAMES, 24, 3)), "trans": TRANS, "fps": 30},
     "SMPL-X, standing along Y": {"poses": 0.1 * _poses(165), "trans": TRANS, "mocap_frame_rate": 30},

@@ -27,6 +27,9 @@ export const MAX_DISTANCE = 1000.0;
 export const MAX_HEIGHT = 30.0;
 export const MAX_SPEED = 20.0;
 export const ORDERS = ["times", "timestamps", "frame_ids", "frame_id"];
+export const TIMES = ["times", "timestamps"];
+export const FPS_OF_TIMES = [5.0, 1000.0];
+export const UNEVEN = 0.5;
 export const DEFAULT_FPS = 60.0;
 export const FPS_LIMITS = [0.001, 10000.0];
 // rnd_runtime.motion.motion

@@ -1,7 +1,7 @@
 // Array layouts of motions, read into one record in the file's axes (rnd_runtime/motion/readers/arrays.py).
 
 import {
-  AMASS_MEMBERS, DEFAULT_FPS, FPS_LIMITS, MANY_BEYOND_A_TURN, MAX_ANGLE, MAX_DISTANCE, MAX_HEIGHT, MAX_SPEED, NAMES_BY_COUNT, ORTHOGONAL, ORDERS, SMPLX_REST_ROOT, SMPL_REST_ROOT,
+  AMASS_MEMBERS, DEFAULT_FPS, FPS_LIMITS, FPS_OF_TIMES, MANY_BEYOND_A_TURN, MAX_ANGLE, MAX_DISTANCE, MAX_HEIGHT, MAX_SPEED, NAMES_BY_COUNT, ORTHOGONAL, ORDERS, SMPLX_REST_ROOT, SMPL_REST_ROOT, TIMES, UNEVEN,
 } from "../constants.js";
 import { refusal, short, sizes } from "../errors.js";
 import { Npz } from "./npz.js";
@@ -32,7 +32,7 @@ export function readMotionFile(bytes, name) {
   checkTranslations(translations, name);
   if (members.has("betas")) notes.push("the file's betas are ignored: the avatar keeps its own shape");
   checkOrder(members, frames);
-  const fps = readFrameRate(members, notes), stated = readUpAxis(members), up = stated ?? (amass || easymocap ? "z" : "y");
+  const fps = readFrameRate(members, frames, notes), stated = readUpAxis(members), up = stated ?? (amass || easymocap ? "z" : "y");
   const unit = likelyUnit(translations, frames, fps, up === "z" ? 2 : 1);
   if (unit) notes.push(`trans is higher or faster than a person in metres: these look like ${unit}`);
   const restRoot = amass || easymocap ? smplRoot : null;
@@ -161,18 +161,20 @@ function checkTranslations(translations, file) {
   throw refusal("trans", { expected, got: short(distance), file, frame, hint: "are these millimetres?" });
 }
 
+/** [F] of a member; empty where it is missing or no number of each frame, as names of images. */
+function numberOfEach(members, member, frames) {
+  try {
+    const { numbers } = members.has(member) ? members.numbers(member) : { numbers: [] };
+    return numbers.length === frames ? numbers : [];
+  } catch {
+    return [];
+  }
+}
+
 /** Refuses times or frame numbers that do not increase from frame to frame. */
 function checkOrder(members, frames) {
   for (const member of ORDERS) {
-    if (!members.has(member)) continue;
-    let values;
-    try {
-      values = members.numbers(member);
-    } catch {  // names of images, say
-      continue;
-    }
-    const { shape, numbers } = values;
-    if (shape.length !== 1 || shape[0] !== frames) continue;
+    const numbers = numberOfEach(members, member, frames);
     const back = numbers.findIndex((value, frame) => frame > 0 && !(value - numbers[frame - 1] > 0));
     if (back < 0) continue;
     const expected = "numbers that increase from frame to frame", hint = "sort the frames, and remove those that occur twice";
@@ -180,8 +182,23 @@ function checkOrder(members, frames) {
   }
 }
 
-function readFrameRate(members, notes) {
-  const key = members.firstOf("mocap_framerate", "mocap_frame_rate", "fps");
+/** Frames per second of even times in seconds; null without, with a note on uneven ones. */
+function rateOfTimes(members, frames, notes) {
+  const [low, high] = FPS_OF_TIMES;
+  for (const member of TIMES) {
+    const steps = Array.from(numberOfEach(members, member, frames)).map((time, frame, times) => time - times[frame - 1]).slice(1);
+    const step = steps.length ? median([...steps]) : NaN;
+    if (!(low * step <= 1 && 1 <= high * step)) continue;
+    if (steps.some((other) => Math.abs(other - step) > UNEVEN * step))
+      notes.push(`${member} are uneven: the frames are played one after the other`);
+    return Math.round(1000 / step) / 1000;
+  }
+  return null;
+}
+
+function readFrameRate(members, frames, notes) {
+  const byTimes = rateOfTimes(members, frames, notes), key = members.firstOf("mocap_framerate", "mocap_frame_rate", "fps");
+  if (!key && byTimes) return byTimes;
   if (!key) {
     notes.push(`no frame rate in the file: ${DEFAULT_FPS} frames per second assumed`);
     return DEFAULT_FPS;
