@@ -14,16 +14,18 @@ from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
+from rnd_runtime.motion.motion import Motion, load_motion, save_motion
 from rnd_trainer.checking.check import check_capture
 from rnd_trainer.checking.silhouette import mask_iou
 from rnd_trainer.importing.importer import find_layout, import_source
 from rnd_trainer.importing.options import FrameSelection, ImportOptions
 from support import layouts
 from support.imported import assert_posed, import_scene
-from support.known_scene import FRAMES, HEIGHT, WIDTH, shaped_body, view_of
+from support.known_scene import FRAMES, HEIGHT, WIDTH, motion, shaped_body, view_of
 from support.pose_programs import (
     FOCALS,
     INTRINSICS,
+    LENS,
     write_easymocap_folder,
     write_film,
     write_frames,
@@ -84,6 +86,23 @@ def test_a_video_becomes_a_capture(tmp_path, program) -> None:
         assert (images.normal * view.normals).sum(-1)[facing].min() > 0.999
     report = check_capture(tmp_path / "out")
     assert not report.wrong, report.findings
+
+
+def test_poses_of_our_own_body_are_read_as_the_players_read_them(tmp_path) -> None:
+    """``save_motion``'s: ``trans`` is from the body's own pelvis, as its joints' names tell."""
+    body, axes = shaped_body(), LENS.world_to_camera
+    rotations, rest = motion().rotations.copy(), body.skeleton.rest_joints[0]
+    rotations[:, 0] = axes[:3, :3] @ rotations[:, 0]
+    shifts = (rest + motion().translations) @ axes[:3, :3].T + axes[:3, 3] - rest
+    body.save(tmp_path / "body.npz")
+    poses = tmp_path / "poses.npz"
+    save_motion(poses, Motion(rotations, shifts, 25.0, body.skeleton.names))
+    np.testing.assert_allclose(load_motion(poses, body.skeleton).translations, shifts, atol=ATOL)
+    frames = write_frames(tmp_path)
+    notes = _import(tmp_path, frames, poses, body=str(tmp_path / "body.npz"), intrinsics=INTRINSICS)
+    assert not [note for note in notes if "pelvis" in note]
+    _assert_together(tmp_path, LENS, WHOLE, FRAMES)
+    assert check_capture(tmp_path / "out").mean_iou > 0.95
 
 
 PAIRED = {

@@ -32,6 +32,7 @@ class Poses:
     convention: RootConvention = "position"  # "smpl": rest + trans, "easymocap": R rest + Th, "position": as stored
     # of poses on another skeleton: rotations [F, J, 3, 3] and root positions [F, 3] of a body's own
     fit: BodyFit | None = None
+    named: bool = False  # the file names its joints: to a body of the same, ``root`` takes that body's own pelvis
 
     def __post_init__(self) -> None:
         count = len(self.frames)
@@ -87,7 +88,14 @@ def smpl_poses(
     rotations, names = _rotations(axis_angles, joint_names)
     offsets = rows_of_three(member, trans, len(rotations))
     return Poses(
-        np.asarray(frames, np.int64), rotations, lambda rest: rest + offsets, names, family, mean_betas(betas), "smpl"
+        np.asarray(frames, np.int64),
+        rotations,
+        lambda rest: rest + offsets,
+        names,
+        family,
+        mean_betas(betas),
+        "smpl",
+        named=joint_names is not None,
     )
 
 

@@ -50,7 +50,7 @@ def place_scene(dataset: ImportedDataset, model: BodyModel, up: str | None = Non
     same_family = model.family == poses.family or (model.family, poses.family) == ("SMPL-H", "SMPL")
     body = model.shaped(poses.betas if same_family else None)
     rest = body.skeleton.rest_joints[0]
-    if not same_family:
+    if not same_family and not _of_its_own(poses, body):
         rest = SMPLX_REST_ROOT if poses.family == "SMPL-X" else SMPL_REST_ROOT
         notes.append(
             f"the poses are {poses.family}'s and the body is not: shape ignored, {poses.family}'s mean pelvis assumed"
@@ -67,6 +67,11 @@ def place_scene(dataset: ImportedDataset, model: BodyModel, up: str | None = Non
         for name, lens in dataset.lenses.items()
     }
     return PlacedScene(body, motion, cameras, rotation, notes)
+
+
+def _of_its_own(poses: Poses, body: Body) -> bool:
+    """Whether ``poses`` are of a body with these joints, as ``motion.save_motion`` writes them."""
+    return poses.named and poses.convention == "smpl" and set(poses.joint_names) == set(body.skeleton.names)
 
 
 def _match_joints(poses: Poses, body: Body) -> Floats:
