@@ -50,6 +50,10 @@ class FakeAvatar:
     spacing: float = 0.02
     advice: PlayerAdvice = field(default_factory=PlayerAdvice)
 
+    def level(self, number: int) -> FakeAvatar | None:
+        """It has no others than the whole."""
+        return self if number == 0 else None
+
     def encode(self, motion: Motion, time: float) -> Encoded:
         now = motion.at([time])
         joints = self.skeleton.joint_transforms(now.rotations[0], now.translations[0])[:, :3]
