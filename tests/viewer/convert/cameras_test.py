@@ -165,6 +165,7 @@ _FRAME = {"file_path": "0", "transform_matrix": np.eye(4).tolist()}
     ("name", "content", "said"),
     [
         ("a.json", '{"K": []}', "takes it as it is"),
+        ("a.json", '{"cameras": {}, "frames": [{"camera": "cam00"}]}', "takes it as it is"),  # a capture
         ("a.json", '{"frames": []}', "no camera"),
         ("a.json", json.dumps({"frames": [_FRAME]}), "fl_x or camera_angle_x"),
         ("a.json", json.dumps({"fl_x": 500, "k1": 0.2, "frames": [_FRAME]}), "undistort"),

@@ -109,9 +109,10 @@ def _document(content: bytes) -> dict[str, Any]:
 
 
 def _of_transforms(document: Mapping[str, Any], size: tuple[int, int]) -> list[Camera]:
-    if "frames" not in document:
-        hint = "--camera of rnd-play takes it as it is" if {"K", "cameras"} & document.keys() else None
-        raise InputError("camera file", expected="transforms.json with frames", got="none", hint=hint)
+    if "cameras" in document or "frames" not in document:  # a capture has both
+        ours = [name for name in ("cameras", "K") if name in document]
+        got, hint = (ours[0], "--camera of rnd-play takes it as it is") if ours else ("none", None)
+        raise InputError("camera file", expected="transforms.json with frames", got=got, hint=hint)
     frames = document["frames"]
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise InputError("frames of the camera file", expected="a list of objects", got="others")
