@@ -28,6 +28,7 @@ from rnd_runtime.cli.command import (
     show,
     size_text,
 )
+from rnd_runtime.cli.extras import need_packages
 from rnd_runtime.cli.lock import file_lock
 from rnd_runtime.core.errors import InputError, check_cull, check_option, flag, refuse_changed
 from rnd_runtime.shading.light import Up
@@ -98,20 +99,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _export(options: Options) -> None:
-    try:
-        from rnd_export.reduce.variant import Variant
-        from rnd_export.search.bounded import BoundedSearch, export_bounded
-        from rnd_export.search.budget import Bound
-
-        from .export import export
-        from .parity import MAX_FRAMES, random_motion
-    except ModuleNotFoundError as error:
-        hint = 'needs the extra: pip install "rnd-avatar[export]", in a clone ".[export]"'
-        raise InputError(f"{error.name} is not installed", hint=hint) from error
+    need_packages("export", "torch", "cv2", "trimesh", "scipy", "safetensors", "onnx", "onnxscript")
+    from rnd_export.reduce.variant import Variant
+    from rnd_export.search.bounded import BoundedSearch, export_bounded
+    from rnd_export.search.budget import Bound
     from rnd_runtime.avatar.file import advice_of
     from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
     from rnd_runtime.motion.motion import load_motion
     from rnd_trainer.model.checkpoint import load_checkpoint
+
+    from .export import export
+    from .parity import MAX_FRAMES, random_motion
 
     check_option(2 <= options.frames <= MAX_FRAMES, "--frames", f"2 to {MAX_FRAMES}", options.frames)
     search = dataclasses.asdict(options.search)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rnd_runtime.cli.command import parse_subcommand, run_command
-from rnd_runtime.core.errors import InputError
+from rnd_runtime.cli.extras import need_packages
 
 from .lifter.options import Lifter
 from .options import Compare, Frame, Grid, Ground, Raster, Scenes, Step
@@ -59,10 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def command() -> None:
         kinds = {name: kind for name, (kind, _, _) in commands.items()}
         options = parse_subcommand(kinds, prog, words, description=description)
-        for package in ("torch", "safetensors", "scipy"):
-            if importlib.util.find_spec(package) is None:
-                hint = 'needs the extra: pip install "rnd-avatar[bench]", in a clone ".[bench]"'
-                raise InputError(f"{package} is not installed", hint=hint)
+        need_packages("bench", "torch", "safetensors", "scipy")
         _, module, function = next(entry for entry in commands.values() if type(options) is entry[0])
         getattr(importlib.import_module(module), function)(options)
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, get_args
 
+from rnd_runtime.cli.extras import need_packages
 from rnd_runtime.core.errors import InputError
 
 Variant = Literal["auto", "scalar_rgb", "llvm_ad_rgb"]
@@ -28,12 +29,7 @@ probe()
 
 def need_extra() -> None:
     """Raise ``InputError`` if a package of the extra is missing."""
-    from importlib.util import find_spec
-
-    for module, package in (("mitsuba", "mitsuba"), ("skimage", "scikit-image"), ("scipy", "scipy"), ("cv2", "opencv")):
-        if find_spec(module) is None:
-            hint = 'needs the extra: pip install "rnd-avatar[stage]", in a clone ".[stage]"'
-            raise InputError(f"{package} is not installed", hint=hint)
+    need_packages("stage", "mitsuba", "skimage", "scipy", "cv2")
 
 
 def use_variant(wanted: Variant = "auto") -> str:

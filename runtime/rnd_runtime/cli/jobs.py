@@ -23,6 +23,7 @@ from rnd_runtime.core.kernels import prepare_process
 from rnd_runtime.core.threads import cores
 
 from .command import option, warn
+from .extras import need_packages
 from .progress import Progress
 
 if TYPE_CHECKING:
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 On = Annotated[str | None, option("local:N|dask://HOST:PORT")]
-INSTALL = "pip install 'rnd-avatar[dask]'"
 _THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _WARNING = "warning: "
 _alone = threading.Lock()
@@ -41,10 +41,7 @@ def check_on(where: str) -> re.Match[str]:
     match = re.fullmatch(r"local:([1-9]\d{0,2})|dask://([^\s/]+:\d+)", where)
     if match is None:
         raise InputError("--on", expected="local:N or dask://HOST:PORT", got=where)
-    try:
-        import distributed  # noqa: F401
-    except ImportError as error:
-        raise InputError("--on needs Dask distributed, which is not installed", hint=INSTALL) from error
+    need_packages("dask", "distributed", what="--on needs")
     return match
 
 

@@ -464,7 +464,7 @@ def test_refusals_of_the_command(options, capsys, tmp_path, monkeypatch):
         assert main(["avatar.onnx", "--port", str(port), "--no-browser"]) == 2
     errors = capsys.readouterr().err.splitlines()
     assert len(errors) == 3 and errors[1] == f"rnd-view: {COMPILING}" and "--port picks another" in errors[2]
-    monkeypatch.setitem(sys.modules, "websockets.sync.server", None)
+    monkeypatch.setitem(sys.modules, "websockets", None)
     assert main(["avatar.onnx"]) == 2
     assert "rnd-avatar[view]" in capsys.readouterr().err
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rnd_bench.scenes.scenes import USUAL as USUAL_SCENE
+from rnd_runtime.cli.extras import need_packages
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import atomic_path
 
@@ -34,9 +34,8 @@ def check_chart(*files: Path) -> None:
     for file in files:
         if file.suffix not in (".svg", ".png"):
             raise InputError("--chart", expected=".svg or .png", got=file.name)
-    if files and importlib.util.find_spec("matplotlib") is None:
-        hint = 'needs the extra: pip install "rnd-avatar[bench]", in a clone ".[bench]"'
-        raise InputError("matplotlib is not installed", hint=hint)
+    if files:
+        need_packages("bench", "matplotlib")
 
 
 def draw_chart(rows: list[Row], files: Sequence[Path]) -> None:

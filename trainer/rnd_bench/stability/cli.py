@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from rnd_runtime.cli.command import Count, File, Flag, OptionalFile, OptionalFolder, option, show
+from rnd_runtime.cli.extras import install_hint
 from rnd_runtime.core.errors import InputError, check_option
 from rnd_runtime.core.files import sha256_of, write_json
 from rnd_runtime.core.signals import temporary_folder
@@ -63,8 +64,7 @@ def run(options: Stability) -> None:
     try:
         from .rows import ROWS, TIMES
     except ModuleNotFoundError as error:
-        hint = 'needs the extra: pip install "rnd-avatar[dev]", in a clone ".[dev]"'
-        raise InputError(f"{error.name} is not installed", hint=hint) from error
+        raise InputError(f"{error.name} is not installed", hint=install_hint("dev")) from error
     from .table import line_of, rows_of, store
 
     known = [row.id for row in (*ROWS, TIMES)]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from rnd_runtime.cli.command import log
-from rnd_runtime.core.errors import InputError
+from rnd_runtime.cli.extras import need_packages
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,10 +17,7 @@ WIDTH = 140
 
 def need_extra() -> None:
     """Raise ``InputError``, with the extra to install, if a package for training is missing."""
-    for package in ("torch", "safetensors", "scipy"):
-        if importlib.util.find_spec(package) is None:
-            hint = 'needs the extra: pip install "rnd-avatar[train]", in a clone ".[train]"'
-            raise InputError(f"{package} is not installed", hint=hint)
+    need_packages("train", "torch", "safetensors", "scipy")
 
 
 def log_all(notes: Iterable[str]) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from rnd_runtime.cli.extras import install_hint
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.raster import cpu as raster_cpu
@@ -64,8 +65,7 @@ def gsplat_rasterization() -> Any:
     try:
         from gsplat import rasterization
     except ImportError as error:
-        hint = 'needs the extra: pip install "rnd-avatar[cuda]"'
-        raise InputError("gsplat cannot be imported", got=error, hint=hint) from error
+        raise InputError("gsplat cannot be imported", got=error, hint=install_hint("cuda")) from error
     return rasterization
 
 

@@ -13,6 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.cli.extras import need_packages
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import linear_to_srgb, to_bytes
@@ -22,7 +23,6 @@ from .surface import FACING, Surface, inverse_covariances
 
 Floats = NDArray[np.float64]
 
-INSTALL = "pip install 'rnd-avatar[mesh]'"
 NEIGHBOURS = 24  # Gaussians of a texel
 CHUNK = 1 << 15  # texels at once
 PADDING = 4  # texels between charts
@@ -59,11 +59,9 @@ class Textures:
 
 def load_xatlas() -> ModuleType:
     """xatlas. Raises ``InputError`` where it or scipy is missing."""
-    try:
-        import scipy.spatial  # noqa: F401
-        import xatlas
-    except ImportError as error:
-        raise InputError("meshes need xatlas and scipy, which are not installed", hint=INSTALL) from error
+    need_packages("mesh", "xatlas", "scipy", what="meshes need")
+    import xatlas
+
     return xatlas
 
 

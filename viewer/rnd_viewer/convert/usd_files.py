@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.cli.extras import install_hint, need_packages
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import atomic_path
 from rnd_runtime.core.images import write_image
@@ -26,19 +27,17 @@ from .splats import Splats
 from .surface import JOINTS, Surface
 from .texture import Textures, Unwrapped
 
-INSTALL = "pip install 'rnd-avatar[usd]'"
 _REACH = 3.0  # standard deviations within a splat's extent
 
 
 def load_usd() -> ModuleType:
     """``pxr``. Raises ``InputError`` where usd-core is missing or too old for splats."""
-    try:
-        import pxr
-        from pxr import UsdVol
-    except ImportError as error:
-        raise InputError("usd needs usd-core, which is not installed", hint=INSTALL) from error
+    need_packages("usd", "pxr", what="usd needs")
+    import pxr
+    from pxr import UsdVol
+
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
-        raise InputError("usd", expected="usd-core 26.3 or later", got="an older one", hint=INSTALL)
+        raise InputError("usd", expected="usd-core 26.3 or later", got="an older one", hint=install_hint("usd"))
     return pxr
 
 

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.cli.extras import install_hint, need_packages
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import atomic_path
 from rnd_runtime.playback.doctor import Finding
@@ -52,18 +53,14 @@ WEBP = {"quality": "85", "compression_level": "4"}
 
 WEBP_MIN_MS = 11  # of a frame: browsers show one of 10 ms or less for 100
 
-INSTALL = "pip install 'rnd-avatar[video]'"
 _CLIPS = "PyAV (mp4, webp, webm, mov)"
 
 
 def load_pyav(otherwise: str = "") -> ModuleType:
     """Import PyAV, or say which extra brings it and what could be done ``otherwise``."""
-    try:
-        import av
-    except ImportError as error:
-        raise InputError(
-            "mp4, webp, webm and mov need PyAV, which is not installed", hint=INSTALL + otherwise
-        ) from error
+    need_packages("video", "av", what="mp4, webp, webm and mov need", otherwise=otherwise)
+    import av
+
     return av
 
 
@@ -72,7 +69,7 @@ def finding() -> Finding:
     try:
         return Finding(_CLIPS, str(load_pyav().__version__), None)
     except InputError:
-        return Finding(_CLIPS, "missing", INSTALL)
+        return Finding(_CLIPS, "missing", install_hint("video"))
 
 
 def rgb_to_yuv420(image_srgb: Bytes) -> Bytes:

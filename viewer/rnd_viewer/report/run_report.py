@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar.file import metadata_of
+from rnd_runtime.cli.extras import install_hint
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import atomic_path, sha256_of
 from rnd_runtime.core.images import read_image
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.shading.light import Up
-from rnd_viewer.play.video import INSTALL
 
 from .bench import TITLE as BENCH
 from .bench import bench_section
@@ -145,7 +145,7 @@ def _avatar(renders: AvatarRenders, hdrs: tuple[Path, ...], hdr_up: Up) -> dict[
         video = f"<video {clip} autoplay loop muted playsinline controls></video>"
         turntable = figure(video, "turntable, learned light")
     else:
-        turntable = missing(f"The turntable needs PyAV: {INSTALL}")
+        turntable = missing(f"The turntable needs PyAV: {install_hint('video')}")
     lights = strip(figures[: len(lit)], "the avatar in other lights", "body")
     surfaces = strip(figures[len(lit) :], "the avatar's materials", "body")
     html = f'<div class="row">{turntable}{lights}</div><h3>Materials</h3>{surfaces}'

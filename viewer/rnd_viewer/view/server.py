@@ -21,6 +21,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from msgspec.structs import replace
 
+from rnd_runtime.cli.extras import need_packages
 from rnd_runtime.core.errors import InputError, withheld
 from rnd_runtime.core.signals import temporary_folder
 from rnd_runtime.core.threads import set_threads
@@ -34,7 +35,6 @@ from .scene import Bytes, Scene
 from .state import MAX_CLIP_FRAMES, ClipRequest, RenderRequest, Request, parse_request
 from .training import Training
 
-INSTALL = "pip install 'rnd-avatar[view]'"
 JPEG_QUALITY = 90
 _ALL_ADDRESSES = {"0.0.0.0": "192.0.2.1", "::": "2001:db8::1"}  # and one of another network
 MAX_BYTES_IN = 1 << 14  # a request is a few hundred
@@ -61,10 +61,9 @@ HEADERS = {
 
 def load_websockets() -> ModuleType:
     """Import websockets' server or say which extra brings it."""
-    try:
-        import websockets.sync.server
-    except ImportError as error:
-        raise InputError("websockets is not installed", hint=INSTALL) from error
+    need_packages("view", "websockets")
+    import websockets.sync.server
+
     return websockets.sync.server
 
 
@@ -278,10 +277,9 @@ def encode(srgb: Bytes, encoding: str) -> tuple[bytes | Bytes, float]:
 
 
 def _jpeg(srgb: Bytes) -> bytes:
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise InputError("JPEG needs Pillow, which is not installed", hint=INSTALL) from error
+    need_packages("view", "PIL", what="JPEG needs")
+    from PIL import Image
+
     stream = BytesIO()
     Image.fromarray(srgb).save(stream, "jpeg", quality=JPEG_QUALITY)
     return stream.getvalue()

@@ -5,12 +5,12 @@ The graph keeps the input's layout [1, H, W, C] and computes in [1, C, H, W]. We
 
 from __future__ import annotations
 
-import importlib.util
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.cli.extras import need_packages
 from rnd_runtime.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,9 +32,7 @@ def convert(model: bytes, name: str) -> onnx.ModelProto:
     Raises:
         InputError: a package is missing, or the network has an operator or activation beyond those known here.
     """
-    for package in ("tflite", "onnx"):
-        if importlib.util.find_spec(package) is None:
-            raise InputError(f"{package} is not installed", hint='pip install "rnd-avatar[data]", in a clone ".[data]"')
+    need_packages("data", "tflite", "onnx")
     return _Conversion(model, name).model()
 
 

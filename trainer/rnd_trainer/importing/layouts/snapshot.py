@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rnd_runtime.cli.extras import need_packages
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.readers.unpickle import read_pickle
@@ -58,8 +58,7 @@ def _mask(masks: Any, frame: int) -> Bytes:
 
 
 def _hdf5(path: Path, name: str) -> Any:
-    if importlib.util.find_spec("h5py") is None:
-        raise InputError("h5py is not installed", hint='pip install "rnd-avatar[data]", in a clone ".[data]"')
+    need_packages("data", "h5py")
     import h5py
 
     try:

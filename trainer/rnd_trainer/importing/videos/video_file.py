@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.cli.extras import need_packages
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_trainer.importing.images import Bytes
@@ -30,8 +30,7 @@ class VideoFile:
 
     def __init__(self, path: str | Path) -> None:
         self.path = existing_file(path, what="video")
-        if importlib.util.find_spec("av") is None:
-            raise InputError("PyAV is not installed", hint='pip install "rnd-avatar[video]", in a clone ".[video]"')
+        need_packages("video", "av", what="videos need")
         with self._open() as container:
             self.fps = float(container.streams.video[0].average_rate or 30)
             frames = self._decode(container)
