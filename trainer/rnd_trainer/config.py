@@ -201,12 +201,14 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
 
 
 def from_dict(values: dict[str, Any]) -> TrainConfig:
-    """Rebuild a configuration; raises ``InputError`` for an unknown or missing field."""
+    """Rebuild a configuration of this version or an earlier one: fields that are missing get their defaults.
+
+    Raises ``InputError`` for an unknown field.
+    """
     return _build(TrainConfig, {**values, "model": _build(ModelConfig, values["model"])})
 
 
 def _build(kind: Any, values: dict[str, Any]) -> Any:
-    wrong = sorted(set(values) ^ {field.name for field in dataclasses.fields(kind)})
-    if wrong:
-        raise InputError("configuration", expected=f"the fields of {kind.__name__}", got=f"others: {wrong}")
+    if unknown := sorted(set(values) - {field.name for field in dataclasses.fields(kind)}):
+        raise InputError("configuration", expected=f"the fields of {kind.__name__}", got=f"others: {unknown}")
     return kind(**values)
