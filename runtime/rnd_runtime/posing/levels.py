@@ -1,7 +1,8 @@
 """Coarser versions of an avatar, for bodies of few pixels: networks at fewer nodes, and merged pairs of Gaussians.
 
-Pairs are neighbours, the most alike first. Of a pair the positions, covariances and materials are merged by moments, weighted by opacity times area; the heavier
-one gives the skinning. Discs then grow in their plane, by as much as keeps the coverage of the body.
+Pairs are neighbours, the most alike first. Of a pair the positions, covariances and materials are merged by moments,
+weighted by opacity times area; the heavier one gives the skinning. Discs then grow in their plane, by as much as
+keeps the coverage of the body.
 """
 
 from __future__ import annotations
