@@ -85,11 +85,15 @@ class Progress:
             return
         now = time.monotonic()
         self._seen.append((now, done))
-        while self._seen[1][0] < now - _WINDOW:
+        while len(self._seen) > 1 and self._seen[1][0] < now - _WINDOW:
             self._seen.popleft()
         if now >= self._next:
             self._next = now + INTERVAL
             log(" · ".join([self._name, *words, *self._left()]))
+
+    def forget_speed(self) -> None:
+        """Estimate the time left from the next report on, as after a first step that compiles."""
+        self._seen.clear()
 
     def at(self, name: str, done: float, total: float) -> None:
         """Report that ``done`` of ``total`` steps of the phase ``name`` are done; another name begins a phase."""
@@ -104,11 +108,13 @@ class Progress:
 
 
 def track(name: str, items: Iterable[Item], total: int) -> Iterator[Item]:
-    """Yield ``items`` as a phase ``name`` of ``total`` steps."""
+    """Yield ``items`` as a phase ``name`` of ``total`` steps; the first does not count for the time left."""
     with Progress() as progress:
         progress.phase(name, total)
         for done, item in enumerate(items, 1):
             yield item
+            if done == 1:
+                progress.forget_speed()
             progress.update(done)
 
 

@@ -51,16 +51,15 @@ def prepare_process() -> str | None:
     return note
 
 
-def kernels_are_cold() -> bool:
-    """Whether no kernel of the rasteriser is cached yet: a cheap hint, false from the first one on."""
-    raster = _PACKAGE / "raster"
+def kernels_are_cold(package: Path = _PACKAGE / "raster") -> bool:
+    """Whether no kernel of the folder ``package`` is cached yet: a cheap hint, false from the first one on."""
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
-        folders = list(Path(chosen).glob(f"{raster.name}_*"))
+        folders = list(Path(chosen).glob(f"{package.name}_*"))
     else:
         from numba.misc.appdirs import AppDirs  # numba's folder for read-only installations
 
         users = Path(AppDirs(appname="numba", appauthor=False).user_cache_dir)
-        folders = [raster / "__pycache__", *users.glob(f"{raster.name}_*")]
+        folders = [package / "__pycache__", *users.glob(f"{package.name}_*")]
     return not any(file for folder in folders for file in folder.glob("*.nbi"))
 
 

@@ -44,6 +44,18 @@ def test_a_resumed_phase_does_not_count_what_was_done_before(clock, capsys):
     assert "95/100 · 50 s left" in capsys.readouterr().err
 
 
+def test_the_first_item_does_not_count_for_the_time_left(clock, capsys):
+    """It compiles kernels and fills caches."""
+    for number in track("rendering", range(4), 4):
+        clock[0] += 31 if number else 300
+    assert [line.rpartition(" · ")[2] for line in capsys.readouterr().err.splitlines()[1:]] == [
+        "1/4",
+        "62 s left",
+        "31 s left",
+        "0 s left",
+    ]
+
+
 def test_quiet_is_silent_and_items_pass(monkeypatch, capsys):
     monkeypatch.setattr("rnd_runtime.cli.command._running.quiet", True)
     assert list(track("counting", range(3), 3)) == [0, 1, 2]

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from rnd_runtime.cli.lock import LOCK_FILE
+from rnd_runtime.core.kernels import COMPILING
 from rnd_trainer.commands.data import main as rnd_data
 from rnd_trainer.commands.train import main as rnd_train
 from support import layouts
@@ -71,3 +72,15 @@ def test_the_first_holds_it_while_it_works(work, tmp_path, monkeypatch, capfd):
     assert command(out) == 130
     assert name in held[0] and str(os.getpid()) in held[0]
     assert not (out / LOCK_FILE).exists()
+
+
+def test_a_training_says_that_it_compiles_first(tiny_capture, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("rnd_trainer.commands.train._run_with_progress", _stop)
+    for cold in (True, False):
+        monkeypatch.setattr("rnd_trainer.commands.train.kernels_are_cold", lambda package, cold=cold: cold)
+        assert _train(tiny_capture.folder, tmp_path / str(cold)) == 130
+        assert (f"rnd-train: {COMPILING}\n" in capsys.readouterr().err) == cold
+
+
+def _stop(*_: object) -> None:
+    raise KeyboardInterrupt

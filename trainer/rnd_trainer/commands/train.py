@@ -18,6 +18,7 @@ from rnd_runtime.cli.lock import folder_lock
 from rnd_runtime.cli.progress import Progress
 from rnd_runtime.core.errors import InputError, check_option, refuse_changed
 from rnd_runtime.core.files import existing_file, output_folder, write_json
+from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
 
 from .console import log_all, need_extra
 from .eval import EvalOptions, evaluate_run
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from rnd_trainer.training.lighting.lights import KnownLight
     from rnd_trainer.training.training import StepResult, Training
 
+_KERNELS = Path(__file__).parents[1] / "losses"  # a module whose kernels training alone calls
 PREVIEWS = 3
 """rows of a preview: evenly spaced training views"""
 UNKNOWN = {"view": "rnd-view RUN shows a training while it runs"}
@@ -118,6 +120,8 @@ def _train(options: TrainOptions) -> None:
     capture = load_capture(options.capture, motion_file=learning.motion)
     log_all(capture_notes(capture, ["train"] if config.light == "capture" else []))
     known = _known_light(options)
+    if device == "cpu" and kernels_are_cold(_KERNELS):
+        log(COMPILING)
     perceptual, features = load_lpips(learning.perceptual_weights), load_features(learning.consistency_weights)
     with _memory_error_in_one_line():
         training = Training(capture, config, perceptual, device, consistency=features, known=known)
