@@ -94,9 +94,10 @@ def test_a_perturbed_pose_is_near_the_training_pose_with_its_root_and_speed() ->
     assert torch.equal(*twice)
 
 
-def test_jitter_has_the_stated_standard_deviations(model) -> None:
+@pytest.mark.parametrize("generator", [np.random.default_rng(0), torch.Generator().manual_seed(0)])
+def test_jitter_has_the_stated_standard_deviations(model, generator) -> None:
     pose = _poses(1, seed=4)[0]
-    nudged = jittered_pose(pose, np.random.default_rng(0))
+    nudged = jittered_pose(pose, generator)
     moved, faster = nudged.window - pose.window, nudged.velocity - pose.velocity
     assert torch.allclose(moved, moved[:1].expand_as(moved), atol=1e-6)  # the window as a whole
     assert float(moved[0].std()) == pytest.approx(JITTER, rel=0.3)

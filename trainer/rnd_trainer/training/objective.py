@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import torch
@@ -201,13 +200,6 @@ def _if_large(network: Perceptual | None, image: Tensor) -> Perceptual | None:
 def _due(step: int, weight: float, every: int) -> bool:
     """Whether a term with an interval of ``every`` steps is due; its weight is then multiplied by ``every``."""
     return weight > 0 and step % every == 0
-
-
-def noisy(pose: PoseInput, sigma: float, generator: torch.Generator) -> PoseInput:
-    """``pose`` with noise of ``sigma`` radians on the encoders' input; the bones stay exact."""
-    noise = (sigma * torch.randn(pose.window.shape[1:], generator=generator)).to(pose.window)
-    velocity_noise = (10 * sigma * torch.randn(pose.velocity.shape, generator=generator)).to(pose.velocity)
-    return dataclasses.replace(pose, window=pose.window + noise, velocity=pose.velocity + velocity_noise)
 
 
 def _over(splat: Splat, background: Tensor) -> Tensor:

@@ -25,7 +25,9 @@ MAX_WINDOW_SHARE = 0.5
 MAX_PERTURBATION = 0.5
 """largest standard deviation of the rotations that perturb a training pose, rad"""
 JITTER, VELOCITY_JITTER = 0.03, 0.09
-"""standard deviations of the jitter of rotation columns and of joint velocities (rad/s): one frame of slow motion"""
+"""standard deviations of the jitter of rotation columns (rad) and joint velocities (rad/s): one frame of slow motion"""
+VELOCITY_NOISE_RATE = 10.0
+"""noise on the velocities of a training image's pose (rad/s) over the ``pose_noise`` on its rotations (rad), 1/s"""
 
 
 def sampled_pose(skeleton: Skeleton, config: ModelConfig, rng: np.random.Generator) -> PoseInput:
@@ -56,14 +58,24 @@ def perturbed_pose(
     return pose_input(perturbed, skeleton, (frames - 1) / fps, config)
 
 
-def jittered_pose(pose: PoseInput, rng: np.random.Generator) -> PoseInput:
-    """``pose`` with jittered network input: one noise for all poses of its window, and one for the velocities."""
+def jittered_pose(
+    pose: PoseInput,
+    generator: np.random.Generator | torch.Generator,
+    jitter: float = JITTER,
+    velocity_jitter: float = VELOCITY_JITTER,
+) -> PoseInput:
+    """``pose`` with noise on the encoders' input: one for all poses of its window, one for the velocities.
+
+    The bones stay exact. ``jitter`` (rad) and ``velocity_jitter`` (rad/s) are standard deviations.
+    """
 
     def noise(like: Tensor, sigma: float) -> Tensor:
-        return sigma * torch.from_numpy(rng.standard_normal(like.shape)).to(like)
+        if isinstance(generator, torch.Generator):
+            return sigma * torch.randn(like.shape, generator=generator).to(like)
+        return sigma * torch.from_numpy(generator.standard_normal(like.shape)).to(like)
 
-    window = pose.window + noise(pose.window[0], JITTER)
-    return replace(pose, window=window, velocity=pose.velocity + noise(pose.velocity, VELOCITY_JITTER))
+    window = pose.window + noise(pose.window[0], jitter)
+    return replace(pose, window=window, velocity=pose.velocity + noise(pose.velocity, velocity_jitter))
 
 
 def _window(config: ModelConfig) -> tuple[int, float]:

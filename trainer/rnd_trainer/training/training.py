@@ -31,9 +31,9 @@ from .lighting.grey_card import card_gain
 from .lighting.lights import KnownLight, TrainingLights, capture_lights, light_names
 from .lighting.place import placed_light
 from .lighting.skin import TONES, skin_points
-from .objective import Objective, noisy
+from .objective import Objective
 from .pose_refinement import PoseRefinement
-from .sampled_poses import perturbed_pose
+from .sampled_poses import VELOCITY_NOISE_RATE, jittered_pose, perturbed_pose
 from .schedule import Schedule
 from .soap import Soap
 from .state import learned_sha256
@@ -182,7 +182,9 @@ class Training:
         # next view, each once per epoch
         epoch, position = divmod(self.step_index, len(self.views))
         index = int(np.random.default_rng((self.config.seed, epoch)).permutation(len(self.views))[position])
-        view, pose = self.views[index], noisy(self.poses[index], self.config.pose_noise, self.generator)
+        noise = self.config.pose_noise
+        view = self.views[index]
+        pose = jittered_pose(self.poses[index], self.generator, noise, VELOCITY_NOISE_RATE * noise)
 
         # loss
         terms = self._image_terms(view, pose, stage) if stage < 3 else self._unseen_terms(view, pose)
