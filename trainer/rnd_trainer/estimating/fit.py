@@ -25,7 +25,7 @@ from .fitting.state import TO_CAMERA, Layout, State
 from .fitting.terms import BoneTerm, Lens, PointTerm, SharedTerm, mark_points, project
 from .lifted import Lifted
 from .lifter import lift
-from .observations import Observations
+from .observations import FACE, FEET, FINGERS, LANDMARKS, TRUNK, Observations
 
 Floats = NDArray[np.float64]
 OnProgress = Callable[[float, float], None]
@@ -41,28 +41,29 @@ MAX_TURN, MAX_SHIFT = 0.5, 0.4
 """bounds of one step: rad of a joint, m of the root"""
 CORRELATION = 3.5
 """errors of neighbouring frames and points are alike: measured errors over deviations that take them as independent"""
-_LESS_SURE = {11: 1.5, 12: 1.5, 23: 1.5, 24: 1.5, **dict.fromkeys(range(11), 1.3), **dict.fromkeys(range(17, 23), 1.5)}
+_LESS_SURE = ((TRUNK, 1.5), (FACE, 1.3), (FINGERS, 1.5))  # factors of their deviation
+_START_SHARE = 0.1  # weight of face and fingers for the first positions
 
 
 @dataclass(frozen=True)
 class Weights:
-    """How much each term counts, and the deviations it assumes."""
+    """Factors of the terms, without a unit, and the standard deviations that the terms assume."""
 
-    mark_m: float = 0.022  # deviation of a sure landmark at the person's distance
-    spread: float = 1.0  # of the views of one frame, counted as deviation
-    points: float = 2.0
-    bones: float = 0.45
-    limbs: float = 0.105  # rad, of the lifter's limbs and rolls from the body's, beside its own deviation
-    trunk: float = 0.21  # likewise; rigs differ
-    prior: float = 0.03
-    smooth: float = 0.3
-    acceleration: float = 4.0  # m/s² of the trunk along each axis; limbs two to three times that
-    spin: float = 20.0  # rad/s²
-    outline: float = 0.5
-    inner: float = 0.15
-    outline_m: float = 0.012
-    ground: float = 0.03
-    shared: float = 0.1  # part of the frames that count as independent
+    mark_m: float = 0.022  # deviation of a sure landmark at the person's distance, m
+    spread: float = 1.0  # share of the distance between one frame's views that counts as deviation
+    points: float = 2.0  # factor of the landmarks
+    bones: float = 0.45  # factor of the lifter's directions
+    limbs: float = 0.105  # deviation of its limbs and rolls from the body's, beside its own, rad
+    trunk: float = 0.21  # likewise of its trunk; rigs differ, rad
+    prior: float = 0.03  # factor of the prior of poses
+    smooth: float = 0.3  # factor of smoothness
+    acceleration: float = 4.0  # deviation of the trunk's along each axis, m/s²; limbs two to three times that
+    spin: float = 20.0  # deviation of the joints' angular acceleration, rad/s²; factors by joint as above
+    outline: float = 0.5  # factor of the mask's outline against the body's
+    inner: float = 0.15  # factor of body points that lie outside of the mask
+    outline_m: float = 0.012  # deviation of outlines at the person's distance, m
+    ground: float = 0.03  # factor of feet on the ground
+    shared: float = 0.1  # share of the frames that count as independent, in the weight of shape and focal length
 
 
 @dataclass(frozen=True)
@@ -197,23 +198,22 @@ class Fit:
         count = len(observations)
         shape = np.zeros(len(figure.names))
         if self.height is not None and "height" in figure.names:
-            unit = np.zeros(len(shape))
-            unit[0] = 1
-            shape[0] = (self.height - figure.height(0 * unit)) / (figure.height(unit) - figure.height(0 * unit))
+            unit, tall = np.zeros(len(shape)), figure.names.index("height")
+            unit[tall] = 1
+            shape[tall] = (self.height - figure.height(0 * unit)) / (figure.height(unit) - figure.height(0 * unit))
         focal = float(np.exp(self.lens.log_focal))
         state = State(
             rotations, np.zeros((count, 3)), shape, np.zeros_like(self.marks.places), self.lens.log_focal, np.zeros(3)
         )
         posed = state.posed(figure)
-        points = mark_points(state, posed, self.marks)[:, :33] @ TO_CAMERA
+        points = mark_points(state, posed, self.marks)[:, :LANDMARKS] @ TO_CAMERA
         sure = observations.confidence.astype(np.float64) ** 2 / (1 + observations.spread_px.astype(np.float64) ** 2)
-        sure[:, :11] *= 0.1
-        sure[:, 17:23] *= 0.1
+        sure[:, FACE + FINGERS] *= _START_SHARE
         shift = root_positions(points, observations.keypoints_px.astype(np.float64), sure, focal, self.lens.centre)
         translations = shift @ TO_CAMERA
         state = replace(state, translations=translations)
         posed = state.posed(figure)
-        soles = mark_points(state, posed, self.marks)[:, 29:33, 1].min(1)
+        soles = mark_points(state, posed, self.marks)[:, FEET, 1].min(1)
         return replace(state, ground=np.array([np.quantile(soles, 0.3), 0.0, 0.0]))
 
     def _scale(self) -> Floats:
@@ -226,19 +226,19 @@ class Fit:
         count, total = len(o), len(self.marks.joints)
         pixels, deviation = np.zeros((count, total, 2)), np.full((count, total), np.inf)
         scale = self._scale()[:, None]
-        pixels[:, :33] = o.keypoints_px
+        pixels[:, :LANDMARKS] = o.keypoints_px
         confidence = np.clip(o.confidence.astype(np.float64), 1e-3, 1)
-        base = w.mark_m * scale * np.ones((1, 33))
-        for mark, factor in _LESS_SURE.items():
-            base[:, mark] *= factor
-        deviation[:, :33] = np.hypot(base / confidence, w.spread * o.spread_px)
+        base = w.mark_m * scale * np.ones((1, LANDMARKS))
+        for marks, factor in _LESS_SURE:
+            base[:, marks] *= factor
+        deviation[:, :LANDMARKS] = np.hypot(base / confidence, w.spread * o.spread_px)
         for side in range(2):
             sure = o.hands_confidence[:, side].astype(np.float64)
             seen = (sure > 0.3) & np.isfinite(o.hands_px[:, side]).all((1, 2))
             here = slice(HAND_MARKS + 4 * side, HAND_MARKS + 4 * side + 4)
             pixels[seen, here] = o.hands_px[seen, side][:, list(KNUCKLES)]
             deviation[seen, here] = (0.6 * w.mark_m * scale / np.clip(sure, 0.1, 1)[:, None])[seen]
-        deviation[:, :33][~np.isfinite(o.keypoints_px).all(-1)] = np.inf
+        deviation[:, :LANDMARKS][~np.isfinite(o.keypoints_px).all(-1)] = np.inf
         pixels = np.nan_to_num(pixels)
         return PointTerm(pixels, deviation, stage.limit, w.points * stage.points)
 
@@ -333,7 +333,7 @@ class Fit:
         )
 
     def _residuals(self, posed: Posed) -> Floats:
-        pixels, _ = project(mark_points(self.state, posed, self.marks)[:, :33], self.state, self.lens)
+        pixels, _ = project(mark_points(self.state, posed, self.marks)[:, :LANDMARKS], self.state, self.lens)
         gaps = np.linalg.norm(pixels - self.observations.keypoints_px, axis=-1)
         sure = self.observations.confidence > 0.5
         return np.array([np.median(gap[here]) if here.any() else np.inf for gap, here in zip(gaps, sure)])

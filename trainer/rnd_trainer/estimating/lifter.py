@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rnd_runtime.core.errors import InputError
 
 from .lifted import JOINTS, Lifted
-from .observations import Observations
+from .observations import TRUNK, Observations
 
 Floats32 = NDArray[np.float32]
 
@@ -30,7 +30,6 @@ LIMBS = np.array([(a + side, b + side) for a, b in _LIMBS for side in (0, 1)])
 CHANNELS = len(POINTS) * 6 + len(LIMBS) * 6 + 2
 """inputs a frame: 2D, confidence and 3D of the points, directions of the limbs, distance, time to the nearest frame"""
 _SMOOTH = 4  # frames on each side over which centre and size are averaged
-_TORSO = [11, 12, 23, 24]
 _GAP = 0.5  # s; frames of the video farther apart than this are not interpolated as one motion
 
 
@@ -57,8 +56,8 @@ def features(rays: Floats32, confidence: Floats32, hint_m: Floats32, gap_s: Floa
         gap_s: [B, T] time to the nearest frame of the video, s.
     """
     seen = confidence[..., None] + 0.05
-    torso = seen[:, :, _TORSO]
-    middle = _smoothed((rays[:, :, _TORSO] * torso).sum(2) / torso.sum(2))
+    torso = seen[:, :, TRUNK]
+    middle = _smoothed((rays[:, :, TRUNK] * torso).sum(2) / torso.sum(2))
     views = looking_at(middle)
     rotated = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) @ np.swapaxes(views, -1, -2)
     flat = rotated[..., :2] / np.maximum(rotated[..., 2:], 0.05)

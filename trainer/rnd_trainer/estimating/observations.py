@@ -25,6 +25,12 @@ BLAZEPOSE = (
     *("left_heel", "right_heel", "left_foot_index", "right_foot_index"),
 )
 """names of the 33 points in the network's order; left and right are the person's"""
+LANDMARKS = len(BLAZEPOSE)
+FACE = list(range(BLAZEPOSE.index("left_shoulder")))
+FINGERS = list(range(BLAZEPOSE.index("left_pinky"), BLAZEPOSE.index("left_hip")))
+FEET = list(range(BLAZEPOSE.index("left_heel"), LANDMARKS))
+TRUNK = [BLAZEPOSE.index(side + joint) for joint in ("shoulder", "hip") for side in ("left_", "right_")]
+"""points of the shoulders and hips; likewise of the face, hands, and heels with toes"""
 HAND_POINTS = 21
 """points of a hand: the wrist, then four of each finger from the thumb on, base to tip"""
 _LEVEL = 3  # zlib's, of a mask's PNG: higher ones cost time and save little

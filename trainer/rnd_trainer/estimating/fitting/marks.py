@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_trainer.estimating.observations import FINGERS, LANDMARKS, TRUNK
+
 from .figure import Figure
 
 Floats = NDArray[np.float64]
@@ -18,7 +20,7 @@ JOINT_MARKS = {11: "shoulder", 13: "elbow", 15: "wrist", 23: "hip", 25: "knee", 
 _ON_HAND = {19: (1.0, 0, 0.24), 17: (0.85, 0, -0.34), 21: (0.60, -0.10, 0.52)}
 _KNUCKLES_ON_HAND = ((1.0, 0, 0.24), (1.02, 0, 0.0), (0.96, 0, -0.20), (0.85, 0, -0.34))
 _MIDDLE_KNUCKLE_M = 0.092
-HAND_MARKS = 33
+HAND_MARKS = LANDMARKS
 """number of the first knuckle among ``Marks``: 4 of the left hand, then 4 of the right"""
 
 
@@ -78,8 +80,8 @@ def marks_of(figure: Figure) -> Marks:
     for left in (7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31):
         mirror[[left, left + 1]] = left + 1, left
     mirror[HAND_MARKS:] = HAND_MARKS + np.array([4, 5, 6, 7, 0, 1, 2, 3])
-    freedom[[11, 12, 23, 24]] = 0.03
-    freedom[17:23] = freedom[HAND_MARKS:] = 0.015
+    freedom[TRUNK] = 0.03
+    freedom[FINGERS] = freedom[HAND_MARKS:] = 0.015
     return Marks(joints, places, basis, mirror, freedom)
 
 

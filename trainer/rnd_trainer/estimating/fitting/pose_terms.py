@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.rotations import matrix_to_axis_angle
+from rnd_trainer.estimating.observations import FEET
 
 from .figure import JOINTS, Figure
 from .kinematics import Posed, attached, point_derivative
@@ -18,8 +19,6 @@ from .state import Layout, State
 from .terms import marks_by_shape, robust
 
 Floats = NDArray[np.float64]
-
-HEEL_TOE = (29, 30, 31, 32)
 
 
 def right_jacobian_inverse(vectors: Floats) -> Floats:
@@ -167,7 +166,7 @@ class GroundTerm:
         layout: Layout,
         equations: NormalEquations | None,
     ) -> float:
-        chosen = np.array(HEEL_TOE)
+        chosen = np.array(FEET)
         soles = _part(marks, chosen)
         places = soles.places + np.tensordot(state.shape, soles.basis, 1)
         points = attached(posed, soles.joints, places)
