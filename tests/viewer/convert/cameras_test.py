@@ -68,13 +68,20 @@ def test_an_angle_of_view_is_enough(tmp_path):
     _assert_same(got, _camera())
 
 
-def _glb(path, times: np.ndarray, cameras: list[Camera]) -> None:
-    """A camera below a node that is rotated and moved, as Blender writes it, animated by rotation and translation."""
+def _glb(path, times: np.ndarray, cameras: list[Camera], spline: bool = False) -> None:
+    """A camera below a node that is rotated and moved, as Blender writes it, animated by rotation and translation.
+
+    A ``spline`` has tangents of zero. A .gltf has its buffer in a file beside it.
+    """
     above = np.eye(4)
     above[:3, :3], above[:3, 3] = Rotation.from_euler("y", 30, degrees=True).as_matrix(), [0.2, 0, -0.1]
     local = [np.linalg.inv(above) @ np.linalg.inv(c.world_to_camera) @ GL for c in cameras]
     rotations = np.array([Rotation.from_matrix(m[:3, :3]).as_quat() for m in local], "<f4")
     translations = np.array([m[:3, 3] for m in local], "<f4")
+    start = {"translation": translations[0].tolist(), "rotation": rotations[0].tolist()}
+    if spline:
+        rotations, translations = (np.stack([0 * v, v, 0 * v], 1) for v in (rotations, translations))
+    how = {"interpolation": "CUBICSPLINE"} if spline else {}
     chunks = [times.astype("<f4").tobytes(), rotations.tobytes(), translations.tobytes()]
     starts = np.cumsum([0, *map(len, chunks)])
     document = {
@@ -83,7 +90,7 @@ def _glb(path, times: np.ndarray, cameras: list[Camera]) -> None:
         "nodes": [
             {"translation": above[:3, 3].tolist(), "rotation": Rotation.from_matrix(above[:3, :3]).as_quat().tolist()}
             | {"children": [1]},
-            {"name": "shot", "camera": 0, "translation": translations[0].tolist(), "rotation": rotations[0].tolist()},
+            {"name": "shot", "camera": 0, **start},
         ],
         "cameras": [{"type": "perspective", "perspective": {"yfov": 0.7, "aspectRatio": 640 / 360, "znear": 0.1}}],
         "buffers": [{"byteLength": int(starts[-1])}],
@@ -91,12 +98,12 @@ def _glb(path, times: np.ndarray, cameras: list[Camera]) -> None:
             {"buffer": 0, "byteOffset": int(starts[k]), "byteLength": len(chunk)} for k, chunk in enumerate(chunks)
         ],
         "accessors": [
-            {"bufferView": k, "componentType": 5126, "count": len(times), "type": kind}
+            {"bufferView": k, "componentType": 5126, "count": len(times) * (3 if spline and k else 1), "type": kind}
             for k, kind in enumerate(("SCALAR", "VEC4", "VEC3"))
         ],
         "animations": [
             {
-                "samplers": [{"input": 0, "output": 1}, {"input": 0, "output": 2}],
+                "samplers": [{"input": 0, "output": 1, **how}, {"input": 0, "output": 2, **how}],
                 "channels": [
                     {"sampler": 0, "target": {"node": 1, "path": "rotation"}},
                     {"sampler": 1, "target": {"node": 1, "path": "translation"}},
@@ -104,6 +111,11 @@ def _glb(path, times: np.ndarray, cameras: list[Camera]) -> None:
             }
         ],
     }
+    if path.suffix == ".gltf":
+        document["buffers"][0]["uri"] = "keys.bin"
+        path.with_name("keys.bin").write_bytes(b"".join(chunks))
+        path.write_text(json.dumps(document))
+        return
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     data = b"".join(chunks)
@@ -121,6 +133,19 @@ def test_an_animated_camera_of_gltf(tmp_path):
     for ours, theirs in zip(got, wanted):
         _assert_same(ours, theirs)
     assert len(_converted(tmp_path / "a.glb", tmp_path / "twice.json", "--size", "640x360", "--fps", "48")) == 7
+
+
+@pytest.mark.parametrize(("spline", "share"), [(False, 1 / 4), (True, 5 / 32)])
+def test_between_keys_a_camera_of_gltf_rotates_evenly_or_along_its_spline(tmp_path, spline, share):
+    """A quarter after a key: a quarter of the way and of the angle, of splines 3t² − 2t³ of the way."""
+    ends = [_camera((0, 2, 4)), _camera((4, 2, 0))]
+    _glb(tmp_path / "a.gltf", np.arange(2), ends, spline)
+    first, second, *_, last = _converted(tmp_path / "a.gltf", tmp_path / "out.json", "--size", "640x360", "--fps", "4")
+    start, now, end = (np.linalg.inv(camera.world_to_camera) for camera in (first, second, last))
+    np.testing.assert_allclose(now[:3, 3], (1 - share) * start[:3, 3] + share * end[:3, 3], atol=1e-6)
+    angle, whole = (Rotation.from_matrix(start[:3, :3].T @ m[:3, :3]).magnitude() for m in (now, end))
+    if not spline:  # whose quaternions lie on the chord
+        assert angle == pytest.approx(share * whole, rel=1e-5)
 
 
 @pytest.mark.parametrize(("size", "shown"), [("640x640", (640, 360)), ("720x360", (640, 360)), ("320x180", (320, 180))])
@@ -172,9 +197,10 @@ _FRAME = {"file_path": "0", "transform_matrix": np.eye(4).tolist()}
         ("a.json", json.dumps({"fl_x": 500, "frames": [{"transform_matrix": [[0] * 4] * 4}]}), "a rotation"),
         ("a.json", "[1]", "an object"),
         ("a.json", "{", "cannot be read"),
-        ("a.gltf", '{"nodes": []}', "no camera"),
-        ("a.gltf", '{"nodes": [{"camera": 0, "name": "x"}, {"camera": 0, "name": "y"}], "cameras": [{}]}', "x, y"),
-        ("a.gltf", '{"nodes": [{"camera": 0}], "cameras": [{"type": "orthographic"}]}', "perspective"),
+        ("a.gltf", '{"asset": {}, "nodes": []}', "no camera"),
+        ("a.gltf", '{"nodes": []}', "a glTF document"),
+        ("a.gltf", json.dumps({"asset": {}, "nodes": [{"camera": 0, "name": name} for name in "xy"]}), "x, y"),
+        ("a.gltf", '{"asset": {}, "nodes": [{"camera": 0}], "cameras": [{"type": "orthographic"}]}', "perspective"),
         ("a.glb", "glTF", "cannot be read"),
         ("a.blend", "BLENDER", "glTF"),
     ],

@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.core.budget import Budget
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file, write_json
+from rnd_runtime.motion.formats.gltf import MAX_FRAMES, GltfDocument, Tracks, local_parts, parents_of, tracks_of
 from rnd_runtime.motion.motion import Z_UP_TO_Y_UP
 
 Floats = NDArray[np.float64]
@@ -38,7 +38,6 @@ FLIP = np.diag([1.0, -1, -1, 1])
 """OpenGL's camera axes (Y up, looking along −Z) ↔ OpenCV's"""
 _SUFFIXES = ".json (transforms.json), .gltf, .glb, .usd, .usda, .usdc or .usdz"
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_MAX_FRAMES = 200_000
 _UNDISTORTED = 1e-4  # max coefficient of a lens that counts as a pinhole
 
 
@@ -146,13 +145,8 @@ def _of_entry(entry: Mapping[str, Any], size: tuple[int, int]) -> Camera:
 
 
 def _of_gltf(file: Path, name: str | None, size: tuple[int, int], fps: float) -> list[Camera]:
-    content, buffer = file.read_bytes(), b""
-    if content[:4] == b"glTF":
-        length = struct.unpack_from("<I", content, 12)[0]
-        document, buffer = _document(content[20 : 20 + length]), content[28 + length :]
-    else:
-        document = _document(content)
-    nodes = document.get("nodes", [])
+    gltf = GltfDocument(file)
+    document, nodes = gltf.json, gltf.json.get("nodes", [])
     found = {
         str(node.get("name") or document["cameras"][node["camera"]].get("name") or index): index
         for index, node in enumerate(nodes)
@@ -167,82 +161,24 @@ def _of_gltf(file: Path, name: str | None, size: tuple[int, int], fps: float) ->
     high = 0.5 * min(height, width / aspect)  # square pixels, and all that the camera sees is in the image
     focal = high / math.tan(0.5 * float(lens["perspective"]["yfov"]))
     K = _intrinsics(focal, focal, width / 2, height / 2)
-    parents = {child: index for index, node in enumerate(nodes) for child in node.get("children", [])}
-    chain = [chosen]
-    while chain[-1] in parents:
+    parents, chain = parents_of(nodes), [chosen]
+    while parents[chain[-1]] >= 0:
         chain.append(parents[chain[-1]])
-        if len(chain) > len(nodes):
-            raise InputError("nodes", expected="a tree", got="a circle")
-    tracks = _tracks(document, buffer, set(chain), file)
-    keys = np.concatenate([keys for paths in tracks.values() for keys, _ in paths.values()] or [np.zeros(1)])
-    frames = round(float(np.ptp(keys)) * fps) + 1
-    if frames > _MAX_FRAMES:
-        raise InputError("animation of the camera", expected=f"at most {_MAX_FRAMES} frames", got=frames)
-    times = keys.min() + np.arange(frames) / fps
-    cameras = []
-    for time in times:
-        world = np.eye(4)
-        for index in chain:  # from the camera up
-            world = _local(nodes[index], tracks.get(index, {}), float(time)) @ world
-        cameras.append(from_opengl(world, K, size))
-    return cameras
-
-
-def _tracks(
-    document: Mapping[str, Any], buffer: bytes, wanted: set[int], file: Path
-) -> dict[int, dict[str, tuple[Floats, Floats]]]:
-    """Keys, s, and values of each animated property of the ``wanted`` nodes."""
-    tracks: dict[int, dict[str, tuple[Floats, Floats]]] = {}
-    budget = Budget.of(file)
+    tracks: Tracks = {}
     for animation in document.get("animations", []):
-        for channel in animation["channels"]:
-            node, path = channel["target"].get("node"), channel["target"]["path"]
-            if node not in wanted or path not in ("translation", "rotation", "scale"):
-                continue
-            sampler = animation["samplers"][channel["sampler"]]
-            keys, values = (_accessor(document, buffer, sampler[key], budget) for key in ("input", "output"))
-            if sampler.get("interpolation") == "CUBICSPLINE":
-                values = values[1::3]  # between their tangents
-            tracks.setdefault(node, {})[path] = keys[:, 0], values
-    return tracks
-
-
-def _accessor(document: Mapping[str, Any], buffer: bytes, index: int, budget: Budget) -> Floats:
-    accessor = document["accessors"][index]
-    view = document["bufferViews"][accessor["bufferView"]]
-    if accessor["componentType"] != 5126 or "sparse" in accessor or "byteStride" in view or not buffer:
-        raise InputError("animation", expected="packed floats in a .glb", got="others")
-    width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
-    budget.take(8 * accessor["count"] * width, "animation")
-    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    values = np.frombuffer(buffer, "<f4", accessor["count"] * width, start)
-    return values.reshape(-1, width).astype(np.float64)
-
-
-def _local(node: Mapping[str, Any], tracks: Mapping[str, tuple[Floats, Floats]], time: float) -> Floats:
-    if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    rest = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]}
-    now = {path: np.array(node.get(path, value), np.float64) for path, value in rest.items()}
-    for path, (keys, values) in tracks.items():
-        last = int(np.clip(np.searchsorted(keys, time, side="right"), 1, max(len(keys) - 1, 1)))
-        first = last - 1
-        last = min(last, len(keys) - 1)
-        share = 0.0 if first == last else np.clip((time - keys[first]) / (keys[last] - keys[first]), 0, 1)
-        a, b = values[first], values[last]
-        b = -b if path == "rotation" and a @ b < 0 else b
-        now[path] = (1 - share) * a + share * b
-    x, y, z, w = now["rotation"] / np.linalg.norm(now["rotation"])
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    local = np.eye(4)
-    local[:3, :3], local[:3, 3] = rotation * now["scale"], now["translation"]
-    return local
+        tracks |= tracks_of(gltf, animation, chain)
+    keys = np.concatenate([keys for keys, _, _ in tracks.values()] or [np.zeros(1)])
+    frames = round(float(np.ptp(keys)) * fps) + 1
+    if frames > MAX_FRAMES:
+        raise InputError("animation of the camera", expected=f"at most {MAX_FRAMES} frames", got=frames)
+    times = keys.min() + np.arange(frames) / fps
+    world = np.tile(np.eye(4), (frames, 1, 1))
+    for node in chain:  # from the camera up
+        rotation, translation, scale = local_parts(nodes, node, tracks, times)
+        local = np.tile(np.eye(4), (frames, 1, 1))
+        local[:, :3, :3], local[:, :3, 3] = rotation * scale[..., None, :], translation
+        world = local @ world
+    return [from_opengl(matrix, K, size) for matrix in world]
 
 
 def _of_usd(file: Path, name: str | None, size: tuple[int, int]) -> list[Camera]:

@@ -21,6 +21,7 @@ from rnd_runtime import __version__
 from rnd_runtime.avatar.onnx_parts import bytes_field, number_field
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import atomic_path
+from rnd_runtime.core.rotations import quaternion_to_matrix
 
 from .splats import SH_0, Splats
 
@@ -36,16 +37,7 @@ _LATE = 1e-3  # of a frame, so that rounded times select their frame
 
 def packed(splats: Splats) -> tuple[Floats32, Floats32]:
     """Rows ``gaussian`` [N, 10] and ``color`` [N, 4] of splats with a view-independent colour."""
-    w, x, y, z = splats.quaternions.T
-    axes = np.stack(
-        [
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        ],
-        axis=-1,
-    ).reshape(-1, 3, 3)
-    factors = axes * splats.scales[:, None, :]
+    factors = quaternion_to_matrix(splats.quaternions) * splats.scales[:, None, :]
     covariances = factors @ np.swapaxes(factors, 1, 2)
     rows, columns = np.triu_indices(3)
     gaussians = np.concatenate([splats.means, splats.opacities[:, None], covariances[:, rows, columns]], axis=1)

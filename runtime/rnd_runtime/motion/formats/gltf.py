@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -20,6 +21,8 @@ from rnd_runtime.motion.readers.tree import Floats, MocapTree, unique_names
 from .rigs import world_tree
 
 SUFFIXES = (".glb", ".gltf", ".vrm", ".vrma")
+Tracks = dict[tuple[int, str], tuple[Floats, Floats, str]]
+"""times [K], values and interpolation by (node, path)"""
 _MAGIC, _JSON, _BIN = b"glTF", 0x4E4F534A, 0x004E4942
 _TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -27,7 +30,7 @@ _PATHS = {"rotation": 4, "translation": 3, "scale": 3}
 _FPS = 30.0  # of sparse keys
 _FPS_LIMITS = (5.0, 240.0)
 _ROUNDED = 0.02  # relative distance to a whole number of frames per second
-_MAX_FRAMES, _MAX_NODES = 200_000, 20_000
+MAX_FRAMES, _MAX_NODES = 200_000, 20_000
 _MAX_NUMBER = 1e6
 _HUMANOID = {
     **{"hips": "pelvis", "spine": "spine1", "chest": "spine2", "upperChest": "spine3", "neck": "neck", "head": "head"},
@@ -53,7 +56,7 @@ def read_gltf(path: str | Path) -> tuple[MocapTree, dict[str, int] | None]:
     """
     path = existing_file(path, what="motion")
     try:
-        return _read(_Document(path))
+        return _read(GltfDocument(path))
     except InputError as error:
         raise error.at(file=path) from error
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, struct.error, OverflowError) as error:
@@ -61,7 +64,7 @@ def read_gltf(path: str | Path) -> tuple[MocapTree, dict[str, int] | None]:
         raise InputError("glTF file", expected="a valid one", got=got, file=path) from error
 
 
-class _Document:
+class GltfDocument:
     """JSON and buffers of a glTF file."""
 
     def __init__(self, path: Path) -> None:
@@ -140,16 +143,16 @@ def _chunks(content: bytes) -> tuple[bytes, bytes]:
     return text, binary
 
 
-def _read(document: _Document) -> tuple[MocapTree, dict[str, int] | None]:
+def _read(document: GltfDocument) -> tuple[MocapTree, dict[str, int] | None]:
     nodes = document.json.get("nodes", [])
     animations = document.json.get("animations", [])
     if not animations:
         raise InputError("glTF file", expected="an animation", got="none")
-    parents = _parents(nodes)
+    parents = parents_of(nodes)
     turned = [sum(channel["target"]["path"] == "rotation" for channel in one["channels"]) for one in animations]
     taken = next(k for k, count in enumerate(turned) if 2 * count >= max(turned))  # not a face's or a camera's
     animation = animations.pop(taken)
-    tracks = _channels(document, animation, len(nodes))
+    tracks = tracks_of(document, animation)
     if not tracks:
         raise InputError("animation", expected="rotations of nodes", got="none")
     fps, times = _times([times for times, _, _ in tracks.values()])
@@ -172,7 +175,7 @@ def _read(document: _Document) -> tuple[MocapTree, dict[str, int] | None]:
     return tree, {ours: 1 + kept.index(node) for ours, node in humanoid.items() if node in joints}
 
 
-def _parents(nodes: list[dict[str, Any]]) -> list[int]:
+def parents_of(nodes: list[dict[str, Any]]) -> list[int]:
     """[N] parent of each node, −1 for roots; a node has one, and none is above itself."""
     parents = [-1] * len(nodes)
     for node, content in enumerate(nodes):
@@ -189,15 +192,14 @@ def _parents(nodes: list[dict[str, Any]]) -> list[int]:
     return parents
 
 
-def _channels(
-    document: _Document, animation: dict[str, Any], count: int
-) -> dict[tuple[int, str], tuple[Floats, Floats, str]]:
-    """Times [K], values [K, C] (of splines [K, 3, C]) and interpolation by (node, path)."""
-    tracks: dict[tuple[int, str], tuple[Floats, Floats, str]] = {}
+def tracks_of(document: GltfDocument, animation: dict[str, Any], nodes: Collection[int] | None = None) -> Tracks:
+    """Times [K], values [K, C] (of splines [K, 3, C]) and interpolation by (node, path), of all or some ``nodes``."""
+    tracks: Tracks = {}
+    count = len(document.json.get("nodes", ()))
     for channel in animation["channels"]:
         target, sampler = channel["target"], animation["samplers"][channel["sampler"]]
         node, path = target.get("node"), target["path"]
-        if path not in _PATHS or node is None:
+        if path not in _PATHS or node is None or (nodes is not None and node not in nodes):
             continue
         if not 0 <= node < count:
             raise InputError("animation", expected=f"one of {count} nodes", got=node)
@@ -220,8 +222,8 @@ def _times(keys: list[Floats]) -> tuple[float, Floats]:
         fps = 1 / step if low <= 1 / step <= high else _FPS
         fps = float(round(fps)) if abs(round(fps) - fps) < _ROUNDED * fps else fps
     frames = int(np.floor((last - first) * fps + 1e-3)) + 1
-    if not 0 < frames <= _MAX_FRAMES:
-        raise InputError("animation", expected=f"at most {_MAX_FRAMES} frames", got=frames)
+    if not 0 < frames <= MAX_FRAMES:
+        raise InputError("animation", expected=f"at most {MAX_FRAMES} frames", got=frames)
     return fps, np.minimum(first + np.arange(frames) / fps, last)
 
 
@@ -257,10 +259,7 @@ def _sampled(track: tuple[Floats, Floats, str], times: Floats, rotation: bool) -
 
 
 def _world(
-    nodes: list[dict[str, Any]],
-    parents: list[int],
-    tracks: dict[tuple[int, str], tuple[Floats, Floats, str]],
-    times: Floats,
+    nodes: list[dict[str, Any]], parents: list[int], tracks: Tracks, times: Floats
 ) -> tuple[list[int], Floats, Floats]:
     """Nodes with parents first, their world positions [F, N, 3], and rotations [F, N, 3, 3] without scale.
 
@@ -277,14 +276,7 @@ def _world(
     positions, rotations = np.zeros((len(times), len(nodes), 3)), np.zeros((len(times), len(nodes), 3, 3))
     linear = np.zeros((len(times), len(nodes), 3, 3))
     for node in order:
-        at_rest = _rest(nodes[node])
-        quaternion, place, scale = (
-            _sampled(tracks[node, path], times, path == "rotation") if (node, path) in tracks else value
-            for path, value in zip(("rotation", "translation", "scale"), at_rest)
-        )
-        if (np.linalg.norm(quaternion, axis=-1) < 1e-6).any():
-            raise InputError(f"rotation of node {node}", expected="a quaternion", got="zero")
-        turn = quaternion_to_matrix(quaternion[..., [3, 0, 1, 2]])
+        turn, place, scale = local_parts(nodes, node, tracks, times)
         local, flipped = turn * scale[..., None, :], turn * np.where(scale < 0, -1.0, 1.0)[..., None, :]
         above = parents[node]
         if above < 0:
@@ -296,12 +288,24 @@ def _world(
     return order, positions, rotations * np.sign(np.linalg.det(rotations))[..., None, None]
 
 
+def local_parts(nodes: list[dict[str, Any]], node: int, tracks: Tracks, times: Floats) -> tuple[Floats, Floats, Floats]:
+    """Rotation [3, 3], translation [3] and scale [3] of ``node`` below its parent; [F, …] where they are animated."""
+    quaternion, place, scale = (
+        _sampled(tracks[node, path], times, path == "rotation") if (node, path) in tracks else value
+        for path, value in zip(("rotation", "translation", "scale"), _rest(nodes[node]))
+    )
+    if (np.linalg.norm(quaternion, axis=-1) < 1e-6).any():
+        raise InputError(f"rotation of node {node}", expected="a quaternion", got="zero")
+    return quaternion_to_matrix(quaternion[..., [3, 0, 1, 2]]), place, scale
+
+
 def _rest(node: dict[str, Any]) -> tuple[Floats, Floats, Floats]:
     """Quaternion xyzw, translation and scale of a node at rest."""
     if "matrix" in node:
         matrix = np.array(node["matrix"], np.float64).reshape(4, 4).T
         scale = np.linalg.norm(matrix[:3, :3], axis=0)
-        wxyz = matrix_to_quaternion(matrix[:3, :3] / np.maximum(scale, 1e-12))
+        scale[0] *= np.sign(np.linalg.det(matrix[:3, :3])) or 1.0  # a mirrored node
+        wxyz = matrix_to_quaternion(matrix[:3, :3] / np.where(np.abs(scale) < 1e-12, 1e-12, scale))
         return wxyz[[1, 2, 3, 0]], matrix[:3, 3], scale
     parts = (node.get("rotation", [0, 0, 0, 1]), node.get("translation", [0, 0, 0]), node.get("scale", [1, 1, 1]))
     rotation, translation, scale = (np.array(part, np.float64) for part in parts)
@@ -310,7 +314,7 @@ def _rest(node: dict[str, Any]) -> tuple[Floats, Floats, Floats]:
     return rotation, translation, scale
 
 
-def _kept(document: _Document, nodes: list[dict[str, Any]], parents: list[int], animated: set[int]) -> set[int]:
+def _kept(document: GltfDocument, nodes: list[dict[str, Any]], parents: list[int], animated: set[int]) -> set[int]:
     """Nodes of the skeleton: joints of skins, animated nodes and humanoid bones, and all above them."""
     joints = set(animated)
     for skin in document.json.get("skins", []):
