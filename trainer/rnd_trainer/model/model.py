@@ -17,7 +17,7 @@ from .skinning import blend_transforms, tangent_frames, transform_normals
 from .template import WEIGHT_FLOOR, Template
 from .twist import TwistFrames
 
-ALBEDO_RANGE = (0.01, 0.80)
+ALBEDO_RANGE = (0.001, 0.80)
 """of diffuse materials, with black cloth as phones' tone curves show it; bounds the albedo–light ambiguity"""
 TANGENT_SCALE = (0.25, 2.0)
 """range of the standard deviations along the surface, in units of the spacing"""

@@ -91,6 +91,8 @@ def weighted_median(values: Floats, weights: Floats) -> float:
 
 
 def _nearest_rotation(matrix: Floats) -> Floats:
+    if not np.isfinite(matrix).all():
+        return np.full((3, 3), np.nan)
     u, _, v = np.linalg.svd(matrix)
     u[:, 2] *= np.sign(np.linalg.det(u @ v))
     rotation: Floats = u @ v

@@ -12,6 +12,7 @@ from rnd_runtime.motion.readers.tree import MocapTree
 from rnd_runtime.motion.retarget import Retargeted, retarget, retarget_tracks
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.motion.smpl import SMPL_NAMES
+from rnd_runtime.motion.solving.directions import median_rotation
 from rnd_runtime.motion.solving.solve import Tracks
 from support.known_motion import FRAMES, MATRICES, PELVIS, SKELETON
 from support.known_skeletons import assert_same_poses, degrees_apart, world_rotations
@@ -215,3 +216,9 @@ def test_few_frames_are_enough(frames):
     found = retarget(tree(MATRICES[:frames], PELVIS[:frames], zero), SKELETON, MATCHED)
     plain = retarget(tree(MATRICES[:frames], PELVIS[:frames], REST), SKELETON, MATCHED)
     assert_same_poses(found.rotations, plain.rotations)
+
+
+def test_rotations_that_are_no_numbers_have_a_median_that_is_none():
+    rotations = np.tile(np.eye(3), (4, 1, 1))
+    rotations[2] = np.inf
+    assert np.isnan(median_rotation(rotations)).all()
