@@ -55,11 +55,11 @@ class Search:
     """A bound, by which the reduction is searched on this machine."""
 
     target_ms: OptionalNumber = None
-    """The best-looking file that takes this long per frame."""
+    """The best-looking file that takes at most this many milliseconds per frame."""
     min_psnr: OptionalNumber = None
     """The fastest file whose images are within this PSNR (dB) of the whole avatar's."""
     max_mb: OptionalNumber = None
-    """The best-looking file of this size (1e6 bytes)."""
+    """The best-looking file of at most this size (1e6 bytes)."""
     size: Size = (512, None)
     """Image size of the search, in pixels."""
     hdr: OptionalFile = None
@@ -90,7 +90,7 @@ class Options:
     cull: Annotated[float | None, option("COSINE")] = None
     """n·v below which players leave Gaussians out, -1 for none. Default: what does not show."""
     reduction: Annotated[Reduction, *group("reduction")] = field(default_factory=Reduction)
-    search: Annotated[Search, *group("search for a bound")] = field(default_factory=Search)
+    search: Annotated[Search, *group("search")] = field(default_factory=Search)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -127,7 +127,8 @@ def _export(options: Options) -> None:
         motion = random_motion(checkpoint.skeleton, frames=options.frames, seed=0)
     play = f"rnd-play {out} --motion FILE --out FOLDER"
     with file_lock(out, "rnd-export"):
-        for kind, value in bounds.items():
+        if bounds:
+            ((kind, value),) = bounds.items()
             what = BoundedSearch(Bound(kind, value), flag(BOUNDS[kind]), motion, **search)  # type: ignore[arg-type]
             finish(out, export_bounded(checkpoint, out, what, show=show, warn=_log_all), then=play)
             return

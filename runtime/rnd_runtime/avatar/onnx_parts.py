@@ -27,6 +27,7 @@ _DEFAULT_DOMAINS = ("", "ai.onnx")
 
 _VARINT, _EIGHT_BYTES, _LENGTH, _FOUR_BYTES = 0, 1, 2, 5  # wire types
 _LONGEST_VARINT = 10  # bytes: 64 bits, seven in each
+_SHORT = 1024  # bytes of a constant that may be a shape
 
 
 class Node(NamedTuple):
@@ -246,9 +247,6 @@ def _tensor(data: memoryview, record: memoryview) -> tuple[str, Constant]:
     if kind == _INT64 and raw:
         integers = list(struct.unpack(f"<{len(raw) // 8}q", raw[: len(raw) // 8 * 8])) if len(raw) <= _SHORT else []
     return name, Constant(record, tuple(dims), tuple(integers) if kind == _INT64 else None)
-
-
-_SHORT = 1024  # bytes of a constant that may be a shape
 
 
 def _signed(data: memoryview) -> list[int]:

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from rnd_runtime.shading.light import REC709_LUMINANCE, texel_directions, texel_solid_angles
+from rnd_trainer.config import MAX_NODES
 from rnd_trainer.model.model import AvatarModel, PoseInput
 from rnd_trainer.render.probe import PROBE_SHAPE, natural_sky
 from rnd_trainer.training.data import TrainingView
 
 from .observations import (
     MIN_OBSERVATIONS,
-    POINTS,
     Observations,
     albedo_under,
     light_luminance,
@@ -153,8 +153,8 @@ def initial_light(
 def warm_up() -> None:
     """Fit a sky to random data: linear algebra allocates its buffers."""
     rng = np.random.default_rng(0)
-    transport = rng.random((8 * POINTS, SKY_LOBES + math.prod(SEARCH_SHAPE)), dtype=np.float32)
-    colour, point = 0.1 + rng.random((len(transport), 3)), np.arange(len(transport)) % POINTS
+    transport = rng.random((8 * MAX_NODES, SKY_LOBES + math.prod(SEARCH_SHAPE)), dtype=np.float32)
+    colour, point = 0.1 + rng.random((len(transport), 3)), np.arange(len(transport)) % MAX_NODES
     observations = Observations(point, colour, np.zeros(len(point), np.int64), [], 0.0)
     _quadratic(observations, transport, point_luminance(observations)).fit(range(SKY_LOBES))
 

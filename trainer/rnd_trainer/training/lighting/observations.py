@@ -22,8 +22,6 @@ from .skin import BODY_LUMINANCE
 
 Floats = NDArray[np.float64]
 
-POINTS = 3_000
-"""nodes observed"""
 FRAMES = 40
 """images observed, evenly spaced"""
 FACING = 0.3
@@ -62,8 +60,8 @@ class Observations:
 def observe(
     model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[PoseInput], lights: Sequence[int]
 ) -> Observations:
-    """Colours of the first nodes where they are visible, inside the mask and not clipped."""
-    nodes = min(POINTS, model.config.nodes)
+    """Colours of the nodes where they are visible, inside the mask and not clipped."""
+    nodes = model.config.nodes
     spacing = float(model.spacing) * math.sqrt(len(model.points) / nodes)
     of_light = np.array(lights or [0] * len(views))
     groups = [np.flatnonzero(of_light == k) for k in np.unique(of_light)]
