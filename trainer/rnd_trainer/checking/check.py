@@ -77,7 +77,9 @@ def check_capture(path: str | Path, *, on_frame: Callable[[int, int], None] = la
         InputError: the capture cannot be read.
     """
     capture = load_capture(path)
-    findings = [Finding("ok", "files", f"{len(capture.frames)} images of {len(capture.cameras)} cameras")]
+    images, cameras = len(capture.frames), len(capture.cameras)
+    counts = f"{images} image{'s' * (images != 1)} of {cameras} camera{'s' * (cameras != 1)}"
+    findings = [Finding("ok", "files", counts)]
     findings += [*_training(capture), *_lights(capture), *check_geometry(capture)]
     views, ious, normal_pairs, bad_masks, bright = [], [], [], [], []
     for done, frame in enumerate(capture.frames):

@@ -36,9 +36,9 @@ class ImportCommand:
     """
 
     source: Annotated[tyro.conf.Positional[Path], option("SOURCE")]
-    """a data set's folder for one subject, a video, or a folder of frames"""
+    """A data set's folder for one subject, a video, or a folder of frames."""
     out: Annotated[tyro.conf.Positional[Path], option("FOLDER")]
-    """folder for the capture"""
+    """Folder for the capture."""
     reading: Annotated[ImportOptions, tyro.conf.arg(name="")] = field(default_factory=ImportOptions)
 
     def run(self) -> int:
@@ -59,9 +59,9 @@ class CheckCommand:
     """
 
     capture: Annotated[tyro.conf.Positional[Path], option("CAPTURE")]
-    """folder with capture.json, or that file"""
+    """Folder with capture.json, or that file."""
     out: OptionalFolder = None
-    """folder for check.json (IoU of every frame) and check.png (overlay). Default: CAPTURE/check"""
+    """Folder for check.json (IoU of every frame) and check.png (overlay). Default: CAPTURE/check."""
 
     def run(self) -> int:
         from rnd_trainer.checking.report import check_and_report
@@ -78,13 +78,13 @@ class ConvertBodyCommand:
     """
 
     model: Annotated[tyro.conf.Positional[str], option("FILE|anny")]
-    """the model; a pickle is read without executing anything"""
+    """The model; a pickle is read without executing anything."""
     out: Annotated[tyro.conf.Positional[Path], option("FILE")]
-    """the body.npz to write"""
+    """The body.npz to write."""
     betas: Annotated[tuple[float, ...], option("N ...")] = ()
-    """shape parameters, the first of them; the rest are 0"""
+    """Shape parameters, the first of them; the rest are 0."""
     license: Annotated[str | None, option("TEXT")] = None
-    """licence to write into the file"""
+    """Licence to write into the file."""
 
     def run(self) -> int:
         from rnd_trainer.importing.body_models import convert_body_model
@@ -101,7 +101,7 @@ class NetworksCommand:
     """
 
     package: OptionalFile = None
-    """the package's .tgz, if it is on this disk. Default: npm fetches it"""
+    """The package's .tgz, if it is on this disk. Default: npm fetches it."""
 
     def run(self) -> int:
         from rnd_trainer.estimating.observing import networks

@@ -19,11 +19,11 @@ class Schedule:
     preset: Literal["quick", "standard", "full"] = "standard"
     """Some two and a half minutes, ten minutes, or an hour on two cores."""
     steps: OptionalCount = None
-    """Steps with an image. Default: 2400 (quick: 600). The third stage adds 3/4 as many short steps."""
+    """Steps with an image. Default: 2400 (quick: 600, full: 12000). The third stage adds 3/4 as many short steps."""
     gaussians: OptionalCount = None
-    """Number of Gaussians. Default: 30000 (quick: 12000)."""
+    """Number of Gaussians. Default: 30000 (quick: 12000), also of full."""
     image_scale: OptionalNumber = None
-    """Shrink the training images by this factor."""
+    """Size of the training images over that of the capture's, such as 0.5. Default: the preset's."""
     save_every: OptionalCount = None
     """Steps between saved states, from which --resume continues. Default: the preset's."""
     seed: Count = 0

@@ -32,7 +32,7 @@ from rnd_trainer.importing.surfaces.files import attach_files
 from .body_models import BodyModel, load_body_model
 from .dataset import ImportedDataset, undistort_dataset
 from .options import ImportOptions, OnProgress, no_progress
-from .pose_files import read_poses
+from .pose_files import PROGRAMS, read_poses
 from .poses import with_convention
 from .scene import PlacedScene, place_scene
 from .select import refuse_cameras, select_samples
@@ -138,7 +138,7 @@ def _read(
 ) -> ImportedDataset:
     if layout == "video":
         if options.poses is None:
-            raise InputError("--poses", expected="a file from WHAM, GVHMR, 4D-Humans, ROMP or EasyMocap", got="none")
+            raise InputError("--poses", expected=f"a file of {PROGRAMS}, or an SMPL .npz", got="none")
         return video.read(source, model, read_poses(options.poses, person=options.person), options, on_progress)
     more = {"poses": options.poses, "person": options.person} if layout in _EXTERNAL_POSES else {}
     dataset: ImportedDataset = LAYOUTS[layout].read(source, **more)
@@ -150,9 +150,9 @@ def _summary(dataset: ImportedDataset) -> str:
     distorted = any(any(lens.distortion) for lens in dataset.lenses.values())
     size = f"{lens.camera.width} x {lens.camera.height}" + (", distorted lenses" if distorted else "")
     root = {"smpl": "SMPL's root", "easymocap": "EasyMocap's root", "position": "pelvis positions"}
-    poses, count = dataset.poses, len(dataset.lenses)
+    poses, count, images = dataset.poses, len(dataset.lenses), len(dataset.samples)
     return (
-        f"{dataset.kind}: {len(dataset.samples)} images of {count} camera{'s' * (count > 1)}, {size}; "
+        f"{dataset.kind}: {images} image{'s' * (images != 1)} of {count} camera{'s' * (count > 1)}, {size}; "
         f"{len(poses.frames)} poses ({len(poses.joint_names)} joints, {root[poses.convention]})"
     )
 

@@ -22,15 +22,15 @@ class FrameSelection:
     """Which images become part of the capture."""
 
     train_camera: Annotated[str | None, option("NAME")] = None
-    """camera whose first 4/5 train. Default: the first"""
+    """Camera whose first 4/5 train. Default: the first."""
     held_out_every: int = 30
-    """interval of novel views of the other cameras, frames"""
+    """Interval of novel views of the other cameras, frames."""
     every: int = 1
-    """keep frames whose number is a multiple of this"""
+    """Keep frames whose number is a multiple of this."""
     start: int = 0
-    """first frame number to keep"""
+    """First frame number to keep."""
     stop: OptionalCount = None
-    """frame number to stop before"""
+    """Frame number to stop before."""
 
     def keeps(self, frame: int) -> bool:
         """Whether the frame of this number may be taken."""
@@ -42,39 +42,40 @@ class ImportOptions:
     """How to read a source, and what to take of it."""
 
     body: Annotated[str | None, option("FILE|anny")] = None
-    """SMPL, SMPL-H or SMPL-X (.npz or .pkl), a body.npz, or the word anny. Default, of a video: estimated"""
+    """SMPL, SMPL-H or SMPL-X (.npz or .pkl), a body.npz, or the word anny. Default, of a video: estimated."""
     layout: Annotated[str | None, option("LAYOUT", name="as")] = None
-    """layout of SOURCE, such as zju, nerfstudio or video. Default: detected"""
+    """Layout of SOURCE, such as zju, nerfstudio or video. Default: detected."""
     root: Annotated[Literal["smpl", "easymocap"] | None, option("smpl|easymocap")] = None
-    """root convention of the poses. Default: the layout's"""
+    """Root convention of the poses. Default: the layout's."""
     poses: OptionalFile = None
-    """body poses from WHAM, GVHMR, 4D-Humans, ROMP, EasyMocap or an SMPL .npz. Default, of a video: estimated"""
+    """Body poses of WHAM, GVHMR, 4D-Humans, ROMP, EasyMocap, SAM 3D Body, GEM-X, TRAM, PromptHMR or SLAHMR,
+    or an SMPL .npz. Default, of a video: estimated."""
     person: OptionalCount = None
-    """track number in --poses (default: the longest track); without them, which person, counted from the left from 0"""
+    """Track number in --poses (default: the longest track); without them, the person, counted from the left from 0."""
     masks: OptionalFolder = None
-    """masks (.png, .npy) by name or number of the frames, one folder per camera. Default: the source's, or estimated"""
+    """Masks (.png, .npy) by name or number of the frames, a folder per camera. Default: the source's, or estimated."""
     mask_net: OptionalFile = None
-    """segmentation network (.onnx) for the masks"""
+    """Segmentation network (.onnx) for the masks."""
     normals: OptionalFolder = None
-    """normal maps (.npy, .png), named as masks. Default: the source's"""
+    """Normal maps (.npy, .png), named as masks. Default: the source's."""
     normal_net: OptionalFile = None
-    """normal network (.onnx) for the normals"""
+    """Normal network (.onnx) for the normals."""
     normal_axes: Annotated[str | None, option("AXES")] = None
-    """the maps' axes that are right, down, forward, such as x,-y,-z. Default: found by the template"""
+    """The maps' axes that are right, down, forward, such as x,-y,-z. Default: found by the template."""
     albedos: OptionalFolder = None
-    """estimated base colours (.png, .jpg), named as masks: a soft target of training"""
+    """Estimated base colours (.png, .jpg), named as masks: a soft target of training."""
     albedo_net: OptionalFile = None
-    """albedo or de-lighting network (.onnx) for the albedos"""
+    """Albedo or de-lighting network (.onnx) for the albedos."""
     height: OptionalNumber = None
-    """the person's height in metres, of a video without --poses: fixes the scale"""
+    """The person's height in metres, of a video without --poses: fixes the scale."""
     intrinsics: Annotated[tuple[float, ...], option("N N N N")] = ()
-    """fx fy cx cy of a video, in pixels"""
+    """fx fy cx cy of a video, in pixels."""
     distortion: Annotated[tuple[float, ...], option("N ...")] = ()
-    """k1 k2 p1 p2 [k3] of a video; undone once"""
+    """k1 k2 p1 p2 [k3] of a video; undone once."""
     fps: OptionalNumber = None
-    """frames per second. Default: the source's"""
+    """Frames per second. Default: the source's."""
     count: int = 100
-    """training images of a video: the sharpest of each pose"""
+    """Training images of a video: the sharpest of each pose."""
     up: Annotated[Up | None, option("AXIS")] = None
-    """up axis of the source: x, -x, y, -y, z or -z. Default: found by the poses"""
+    """Up axis of the source: x, -x, y, -y, z or -z. Default: found by the poses."""
     selection: Annotated[FrameSelection, *group("frames")] = field(default_factory=FrameSelection)

@@ -36,7 +36,8 @@ from .images import count_shift, list_files, natural_key, numbers_of
 from .poses import PoseFile, Poses, easymocap_poses, rows_of_three, smpl_poses, transformed
 from .recorded_poses import gemx_poses, prompthmr_poses, sam3d_poses, several, slahmr_poses, tram_poses
 
-_KNOWN = "WHAM's, GVHMR's, PHALP's, ROMP's, EasyMocap's, SAM 3D Body's, GEM-X', TRAM's, PromptHMR's or SLAHMR's"
+PROGRAMS = "WHAM, GVHMR, 4D-Humans, ROMP, EasyMocap, SAM 3D Body, GEM-X, TRAM, PromptHMR or SLAHMR"
+"""whose files are read"""
 _ROMP_HALF_ANGLE = np.radians(30.0)
 
 
@@ -134,7 +135,7 @@ def _from_pickle(path: Path, person: int | None) -> PoseFile:
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise InputError("body poses", expected="the layout its keys promise", got=repr(error)) from error
     keys = ", ".join(map(str, list(content)[:6]))
-    raise InputError("body poses", expected=_KNOWN, got=keys)
+    raise InputError("body poses", expected=f"a file of {PROGRAMS}", got=keys)
 
 
 def pair_with_frames(found: PoseFile, numbers: Sequence[int], source: Path) -> tuple[Poses, tuple[str, ...]]:

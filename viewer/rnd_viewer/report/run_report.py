@@ -37,6 +37,7 @@ METRICS = {
     "psnr": ("PSNR, dB", "{:.2f}"),
     "ssim": ("SSIM", "{:.4f}"),
     "lpips": ("LPIPS", "{:.4f}"),
+    "psnr_person": ("PSNR of the person, dB", "{:.2f}"),
     "psnr_box": ("PSNR in the box, dB", "{:.2f}"),
     "psnr_n": ("PSNR of normals, dB", "{:.2f}"),
     "normal_deg": ("normal error, °", "{:.1f}"),
