@@ -77,8 +77,8 @@ def check_capture(path: str | Path, *, on_frame: Callable[[int, int], None] = la
         InputError: the capture cannot be read.
     """
     capture = load_capture(path)
-    images, cameras = len(capture.frames), len(capture.cameras)
-    counts = f"{images} image{'s' * (images != 1)} of {cameras} camera{'s' * (cameras != 1)}"
+    frames, cameras = len(capture.frames), len(capture.cameras)
+    counts = f"{frames} image{'s' * (frames != 1)} of {cameras} camera{'s' * (cameras != 1)}"
     findings = [Finding("ok", "files", counts)]
     findings += [*_training(capture), *_lights(capture), *check_geometry(capture)]
     views, ious, normal_pairs, bad_masks, bright = [], [], [], [], []
