@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from rnd_runtime.posing.skinning import SMALLEST_SQUARE, TWIST_STEPS
+from rnd_runtime.posing.skinning import SHORTEST, SMALLEST_SQUARE, TWIST_STEPS
 from rnd_trainer.model.skinning import NORMAL_FALLBACK, THICKNESS_FLOOR
 
 from .builder import GraphBuilder
 
-NORMALIZE_FLOOR = 1e-9
 _PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]
 
 
@@ -105,7 +104,7 @@ class Posing:
             mixed = graph.op("Add", cofactors, graph.op("Mul", linear, share, name="linear_share"), name="mixed")
             rotated = graph.sum(graph.op("Mul", mixed, rest, name="products"), 1, "rotated")
             length = graph.op("ReduceL2", rotated, self._first_axis(), name="length", keepdims=1)
-            shortest = graph.constant("shortest", np.float32(NORMALIZE_FLOOR))
+            shortest = graph.constant("shortest", SHORTEST)
             return graph.op("Div", rotated, graph.op("Max", length, shortest, name="length_floor"), name="unit")
 
     def widened(self, linear: str, cofactors: str, axes: str, shares: str) -> tuple[str, str]:

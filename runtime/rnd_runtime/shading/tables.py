@@ -175,7 +175,7 @@ def _prefilter(nodes, texels, widths, specular):  # type: ignore[no-untyped-def]
                 red += weight * load(texels, 4 * count + k)
                 green += weight * load(texels, 5 * count + k)
                 blue += weight * load(texels, 6 * count + k)
-            padded = reduce_add(weights)
-            specular[level, i, 0] = reduce_add(red) / padded
-            specular[level, i, 1] = reduce_add(green) / padded
-            specular[level, i, 2] = reduce_add(blue) / padded
+            total = reduce_add(weights)
+            specular[level, i, 0] = reduce_add(red) / total
+            specular[level, i, 1] = reduce_add(green) / total
+            specular[level, i, 2] = reduce_add(blue) / total
