@@ -26,6 +26,7 @@ from rnd_runtime.core.simd.arithmetic import (
 from rnd_runtime.core.simd.memory import aligned_floats, fetch_add, load, prefetch, store
 from rnd_runtime.core.simd.vectors import WIDTH
 
+from . import project
 from .outline import sharpening
 from .project import TILE
 
@@ -34,7 +35,7 @@ HALF_BLOCK = np.float32(1.5)  # px from a block's centre to its outer pixel cent
 BLOCKS = TILE // BLOCK
 PIXELS = TILE * TILE
 ALL_BLOCKS = (1 << (BLOCKS * BLOCKS)) - 1
-LOG2_ALPHA_MIN = np.float32(-math.log2(255.0))
+LOG2_ALPHA_MIN = np.float32(project.LOG2_ALPHA_MIN)
 LOG2_ALPHA_NEARLY_MIN = LOG2_ALPHA_MIN - np.float32(1e-3)  # margin for rounding
 LOG2_ALPHA_MAX = np.float32(math.log2(0.99))
 TRANSMITTANCE_MIN = np.float32(0.9999e-4)  # see raster.oracle
