@@ -127,12 +127,14 @@ def initial_light(
     advance()
     if quadratic.is_undetermined():
         return None
-    coarse_suns = (np.array(_search(quadratic), int) - skies) % len(coarse_directions)
+    above = np.tile(coarse_directions[:, 1] > 0, observations.lights)
+    coarse_suns = (np.array(_search(quadratic, above), int) - skies) % len(coarse_directions)
     advance()
     near_texels = _texels_near(directions, coarse_directions[coarse_suns])
     fine = blocks(with_bounce(transport_of(observations, directions[near_texels], solid_angles[near_texels]), hidden))
     columns = np.concatenate([sky, fine], axis=1)
-    suns = _search(_quadratic(observations, columns, weight))
+    above = np.tile(directions[near_texels, 1] > 0, observations.lights)
+    suns = _search(_quadratic(observations, columns, weight), above)
     advance()
     intensity = _intensities(observations, columns[:, [*range(skies), *suns]])
     advance()
@@ -255,8 +257,8 @@ def _intensities(observations: Observations, columns: NDArray[np.float32]) -> Fl
     return intensity
 
 
-def _search(quadratic: Quadratic) -> list[int]:
-    """Columns of the directional lights, in the order in which they are added.
+def _search(quadratic: Quadratic, above: NDArray[np.bool_]) -> list[int]:
+    """Columns of the directional lights, in the order in which they are added; only those ``above`` the horizon.
 
     Without shadows a direction and its opposite have similar gradients: above degree 1 the SH coefficients of a cosine
     lobe are even only (Ramamoorthi & Hanrahan 2001). ``CANDIDATES`` are therefore fitted.
@@ -270,8 +272,9 @@ def _search(quadratic: Quadratic) -> list[int]:
     while len(columns) < min(skies + MAX_LIGHTS * lights, len(quadratic.irradiance)) and before > noise:
         gain = quadratic.gains(columns, intensity)
         gain[columns] = -np.inf
-        tried = [(quadratic.fit([*columns, int(k)])[0], int(k)) for k in np.argsort(-gain)[:CANDIDATES]]
-        after, best = min(tried)
+        gain[skies:][~above] = -np.inf
+        tried = [k for k in np.argsort(-gain)[:CANDIDATES].tolist() if gain[k] > -np.inf]
+        after, best = min(((quadratic.fit([*columns, k])[0], k) for k in tried), default=(before, -1))
         if before - after < MIN_GAIN / lights * before:
             break
         columns.append(best)
