@@ -74,6 +74,17 @@ def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
         assert grey.max() < 2 * grey.mean()  # a white sky stays one
 
 
+def test_no_sun_is_below_the_floor(monkeypatch) -> None:
+    """Light from below is the ground's: broad."""
+    sun = np.array([0.5, -0.7, 0.51])
+    ball = rotating_ball(sun / np.linalg.norm(sun), 6.0)
+    monkeypatch.setattr(light_search, "observe", lambda *_: ball)
+    found = initial_light(None, [], [])  # type: ignore[arg-type]  # the observations are given
+    assert found is not None
+    below = found.radiance[0][16:].mean(axis=2)
+    assert below.max() < 4 * below.mean()
+
+
 def test_the_sun_keeps_its_strength_under_texture_and_wrong_shadows(monkeypatch) -> None:
     """Noise of 30 % on colours, a quarter of the shade twice as bright; least squares alone lose 23 % of the sun."""
     sun = np.array([0.7, 0.5, 0.51]) / np.linalg.norm([0.7, 0.5, 0.51])
