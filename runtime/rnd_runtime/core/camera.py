@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,13 @@ class Camera:
     def rays(self) -> Floats:
         """[3, 3]; (column, row, 1) @ rays is the world direction, of depth 1, that an image point sees."""
         return np.linalg.inv(self.K).T @ self.world_to_camera[:3, :3]
+
+    def project(self, points: NDArray[np.floating[Any]]) -> tuple[Floats, Floats]:
+        """Pixels [N, 2], column and row, and depths [N] m of ``points`` [N, 3] m; pixels say nothing at depths ≤ 0."""
+        seen = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        depths = seen[:, 2]
+        scaled = seen[:, :2] / np.where(depths > 0, depths, 1)[:, None]
+        return scaled * self.K[[0, 1], [0, 1]] + self.K[:2, 2], depths
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another resolution; intrinsics scale with the image."""

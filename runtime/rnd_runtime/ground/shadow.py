@@ -101,13 +101,11 @@ class Shadow:
     def region(self, camera: Camera) -> tuple[slice, slice]:
         """Rows and columns of the image that may see the shadow; all where a part of it is not in front of the eye."""
         corners = np.concatenate([_corners(map_, self.plane) for map_ in (self.sky, *(sun for sun, _ in self.suns))])
-        seen = corners @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        size = np.array([camera.height, camera.width])
-        if seen[:, 2].min() < NEAR:
+        pixels, depths = camera.project(corners)
+        if depths.min() < NEAR:
             return slice(0, camera.height), slice(0, camera.width)
-        pixels = (seen[:, :2] / seen[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2])[:, ::-1]
-        low, high = np.floor(pixels.min(axis=0)), np.ceil(pixels.max(axis=0))
-        (top, left), (bottom, right) = (np.clip(edge, 0, size).astype(int).tolist() for edge in (low, high))
+        low, high, size = np.floor(pixels.min(axis=0)), np.ceil(pixels.max(axis=0)), (camera.width, camera.height)
+        (left, top), (right, bottom) = (np.clip(edge, 0, size).astype(int).tolist() for edge in (low, high))
         return slice(top, bottom), slice(left, right)
 
     def share_at(self, points: Floats) -> Floats:

@@ -119,18 +119,11 @@ def pixel_motion(now: Gaussians, camera: Camera, following: Gaussians, next_came
     Zero behind a camera.
     """
     (here, depth), (there, next_depth) = (
-        _pixels(gaussians.means, view) for gaussians, view in ((now, camera), (following, next_camera))
+        view.project(gaussians.means) for gaussians, view in ((now, camera), (following, next_camera))
     )
     in_front = (depth > NEAR) & (next_depth > NEAR)
     moved = np.where(in_front[:, None], there - here, 0) * [1, -1]
     return moved.astype(np.float32)
-
-
-def _pixels(means: Floats32, camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    seen = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    depth = seen[:, 2]
-    scaled = seen[:, :2] / np.where(depth > NEAR, depth, 1)[:, None]
-    return scaled * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2], depth
 
 
 def ambient_visibility(gaussians: Gaussians) -> Floats32:

@@ -115,10 +115,9 @@ def extent(camera: Camera, points: NDArray[np.floating[Any]]) -> Extent:
         return everywhere
     low, high = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
     corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
-    corners = corners @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    if not corners[:, 2].min() >= NEAR:
+    pixels, corner_depths = camera.project(corners)
+    if not corner_depths.min() >= NEAR:
         return everywhere
-    pixels = corners[:, :2] / corners[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
     size = np.array([camera.width, camera.height])
     (left, top), (right, bottom) = (
         np.clip(edge, 0, size).astype(int).tolist() for edge in (np.floor(pixels.min(0)), np.ceil(pixels.max(0)))
