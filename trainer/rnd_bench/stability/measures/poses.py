@@ -61,8 +61,7 @@ def _holes(subject: Subject, posed: Gaussians, motion: Motion) -> float:
     """Share of the eroded silhouette where alpha is below one half."""
     camera, body = subject.camera(), subject.body
     vertices = blend_skinned(body.skinning_weights, subject.bones(motion, 0.0), body.vertices)[0]
-    points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    pixels = points[:, :2] / points[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+    pixels, _ = camera.project(vertices)
     inside = np.zeros((camera.height, camera.width), np.uint8)
     for triangle in np.round(pixels[body.faces] * 16).astype(np.int32):
         cv2.fillConvexPoly(inside, triangle, 1, shift=4)
