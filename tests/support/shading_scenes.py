@@ -38,12 +38,14 @@ def ball(count=COUNT, seed=0, roughness=(0.35, 0.99), open_sky=False):
     spacing = np.sqrt(4 * np.pi / max(count, 1))
     covariances = np.zeros((count, 6))
     covariances[:, [0, 3, 5]] = (0.6 * spacing) ** 2
+    albedo = rng.uniform(0.03, 0.8, (count, 3))
+    albedo[::4] *= 0.03  # darker than F0
     arrays = (
         normals,
         covariances,
         np.full(count, 0.95),
         normals,
-        rng.uniform(0.03, 0.8, (count, 3)),
+        albedo,
         rng.uniform(*roughness, count),
         visibility,
         root,

@@ -104,6 +104,8 @@ class TrainConfig:
     """L1 between alpha and the mask"""
     weight_normal: float = 0.1
     """λ_n, L1 between splatted and estimated normals; estimates err by about 10°"""
+    weight_tilt: float = 0.1
+    """mean square of the normals' tilt from the template's, where an image has no estimated normals"""
     weight_albedo_estimate: float = 0.008
     """L1 of the log ratio of splatted and estimated albedo; of estimates that keep a fifth of the shading it gains
     0.14 dB of albedo, four times as much loses 0.25 dB"""

@@ -92,20 +92,19 @@ def splat_features(
 ) -> list[Floats32]:
     """Features [N, C] to rasterise for each of ``names``; depth has none. ``given``: those of ``GIVEN``.
 
-    Radiance is linear in albedo: what a black body reflects is specular, the rest is diffuse.
+    From an albedo of F0 on, radiance is linear in albedo: its slope is the diffuse part, the rest is specular.
     """
-    specular = (
-        lit.again(replace(gaussians, albedo=np.zeros_like(gaussians.albedo)))
-        if {"diffuse", "specular"} & {*names}
-        else np.zeros_like(gaussians.albedo)
-    )
+    diffuse = np.zeros_like(gaussians.albedo)
+    if {"diffuse", "specular"} & {*names}:
+        once, twice = (lit.again(replace(gaussians, albedo=np.full_like(diffuse, level))) for level in (1, 2))
+        diffuse = gaussians.albedo * (twice - once)
     features = {
         "albedo": lambda: gaussians.albedo,
         "normal": lambda: gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32),
         "roughness": lambda: gaussians.roughness[:, None],
         "visibility": lambda: ambient_visibility(gaussians)[:, None],
-        "diffuse": lambda: lit.radiance - specular,
-        "specular": lambda: specular,
+        "diffuse": lambda: diffuse,
+        "specular": lambda: lit.radiance - diffuse,
         "shadow": lambda: (
             lit.again(gaussians, np.ones((len(lit.radiance), len(lit.shader.directional)), np.float32)) - lit.radiance
         ),

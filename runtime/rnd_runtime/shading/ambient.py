@@ -15,6 +15,7 @@ from rnd_runtime.core.simd.memory import aligned_floats, load, store
 from rnd_runtime.core.simd.vectors import WIDTH
 from rnd_runtime.shading.sh import COSINE_LOBE, compiled_sh_columns, sh_basis, sh_rotation
 
+from .brdf import specular_share_lanes
 from .lanes import (
     ALBEDO,
     CHUNK,
@@ -107,6 +108,8 @@ def _shade_sixteen(indices, visibility, root_rotation, tables, scratch, rows, co
     visibility_in_lanes(indices, visibility, rows, columns)
     broken = nan_lanes(scratch, columns)
 
+    albedo = load3(scratch, ALBEDO)
+    energy = energy * specular_share_lanes(albedo[0], albedo[1], albedo[2])
     occlusion = lanes(ZERO)
     for j in range(9):
         occlusion += COSINE_LOBE[j] * (at_normal[j] * load(columns, j * WIDTH))

@@ -1,8 +1,10 @@
 """The BRDF of trainer, runtime and tests: Lambert plus GGX, metallic 0.
 
-    f = albedo/π + D·F·G / (4 n·l n·v)
+    f = albedo/π + s · D·F·G / (4 n·l n·v)
 
-with the half vector h = (l + v)/|l + v|, α = γ² (γ the perceptual roughness, clamped to [0.09, 0.99]) and
+with the share s = min(1, max(albedo)/F0): a surface that is darker than any dielectric is a cavity, or a black that
+the camera's tone curve crushed (Karis 2013 fades F likewise). With the half vector h = (l + v)/|l + v| and α = γ² (γ
+the perceptual roughness, clamped to [0.09, 0.99]),
 
     D = α² / (π (sin²θ_h + α² cos²θ_h)²)                              Walter et al. 2007, eq. 33
     G = G1(n·l) G1(n·v),  G1(μ) = 2μ / (μ + √(α² + (1 − α²)μ²))       Walter et al. 2007, eq. 23 and 34
@@ -33,11 +35,6 @@ COSINE_FLOOR = 1e-4
 LARGEST_ALBEDO = 1 - F0 - (1 - F0) / 21
 """max albedo that conserves energy at any roughness; F averages to ∫ F(μ) 2μ dμ = F0 + (1 − F0)/21 over all views"""
 _HALF_FLOOR = 1e-8  # min |l + v|², where light and camera are opposite
-
-
-def brdf(albedo: Any, roughness: Any, n_dot_l: Any, n_dot_v: Any, l_dot_v: Any) -> Any:
-    """f in 1/sr, without the cosine, for arrays that broadcast (numpy or torch)."""
-    return albedo * (1 / pi) + specular(roughness, n_dot_l, n_dot_v, l_dot_v)
 
 
 def specular(roughness: Any, n_dot_l: Any, n_dot_v: Any, l_dot_v: Any) -> Any:
@@ -71,6 +68,20 @@ def _ggx(sqrt: Callable[[Any], Any], at_least: Callable[[Any, Any], Any], number
     return ggx
 
 
+def _specular_share(at_least: Callable[[Any, Any], Any], number: Callable[[float], Any]) -> Any:
+    """The share s for values that ``at_least`` and constants of type ``number`` accept."""
+    zero, one, f0 = (number(x) for x in (0, 1, F0))
+
+    def specular_share(red, green, blue):  # type: ignore[no-untyped-def]
+        """The share s of the specular term."""
+        return one - at_least(one - at_least(at_least(red, green), blue) / f0, zero)
+
+    return specular_share
+
+
+specular_share = _specular_share(np.maximum, float)
+specular_share_scalar = numba.njit(_specular_share(max, np.float32), error_model="numpy")
+specular_share_lanes = numba.njit(_specular_share(at_least, np.float32), error_model="numpy")
 ggx = _ggx(lambda x: x**0.5, lambda x, low: x.clip(min=low), float)  # numpy or torch
 ggx_scalar = numba.njit(_ggx(np.sqrt, max, np.float32), fastmath=True, error_model="numpy")
 ggx_lanes = numba.njit(_ggx(sqrt, at_least, np.float32), error_model="numpy")

@@ -17,7 +17,7 @@ from rnd_runtime.core.simd.arithmetic import at_least, lanes, select, sqrt
 from rnd_runtime.core.simd.memory import aligned_floats, load, store
 from rnd_runtime.core.simd.vectors import WIDTH
 
-from .brdf import ROUGHNESS_RANGE, ggx_lanes
+from .brdf import ROUGHNESS_RANGE, ggx_lanes, specular_share_lanes
 from .lanes import (
     ALBEDO,
     CHUNK,
@@ -88,6 +88,7 @@ def _light_sixteen(indices, visibility, lights, scratch):  # type: ignore[no-unt
     alpha = at_least(clamped(load(scratch, ROUGHNESS), _ROUGHNESS_HIGH), ROUGHNESS_LOW)
     alpha = alpha * alpha
     albedo = load3(scratch, ALBEDO)
+    share = specular_share_lanes(albedo[0], albedo[1], albedo[2])
     red, green, blue = lanes(ZERO), lanes(ZERO), lanes(ZERO)
     for light in range(len(lights.directions)):
         for k in range(WIDTH):
@@ -102,7 +103,7 @@ def _light_sixteen(indices, visibility, lights, scratch):  # type: ignore[no-unt
         sine_squared = (cx * cx + cy * cy + cz * cz) / half_squared
         alpha_squared = alpha * alpha + lights.spread_squared[light] / sqrt(half_squared)
         alpha_squared = select(alpha_squared < ONE, alpha_squared, ONE)
-        specular = ggx_lanes(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared)
+        specular = share * ggx_lanes(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared)
         red += visible_cosine * (albedo[0] * ONE_OVER_PI + specular) * lights.irradiance[light, 0]
         green += visible_cosine * (albedo[1] * ONE_OVER_PI + specular) * lights.irradiance[light, 1]
         blue += visible_cosine * (albedo[2] * ONE_OVER_PI + specular) * lights.irradiance[light, 2]

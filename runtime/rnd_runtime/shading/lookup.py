@@ -10,6 +10,7 @@ from rnd_runtime.core.simd.memory import aligned_floats, broadcast, load, store,
 from rnd_runtime.core.simd.vectors import WIDTH
 from rnd_runtime.shading.sh import compiled_sh_columns
 
+from .brdf import specular_share_lanes
 from .lanes import (
     ALBEDO,
     CHUNK,
@@ -91,6 +92,8 @@ def _shade_sixteen(indices, visibility, rotations, tables, scratch, rows, column
     shrink = load3(columns, 4 * WIDTH)
     visibility_in_lanes(indices, visibility, rows, columns)
     broken = nan_lanes(scratch, columns)
+    albedo = load3(scratch, ALBEDO)
+    energy = energy * specular_share_lanes(albedo[0], albedo[1], albedo[2])
     energy = energy * at_least(_mean_visibility(root_to_light, mean, shrink, columns), ZERO)
 
     _octahedral_cell(mean[0], mean[1], mean[2], SPECULAR_SIZE, scratch)

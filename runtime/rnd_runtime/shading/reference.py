@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.shading.sh import sh_basis
 
-from .brdf import specular
+from .brdf import specular, specular_share
 from .direct import AT_SILHOUETTE, TURNED_AWAY
 from .directional import extract_directional
 from .light import Light, texel_directions, texel_solid_angles
@@ -112,6 +112,7 @@ def _sum_over_texels(
         roughness = np.asarray(gaussians.roughness[part], np.float64)[:, None]
         visible_cosine = visibility(part) * np.maximum(n_dot_l, 0)
         # f = albedo/π + specular, which all channels share
-        specular_sum = visible_cosine * specular(roughness, n_dot_l, n_dot_v, l_dot_v)
+        share = specular_share(*np.asarray(gaussians.albedo[part], np.float64).T)[:, None]
+        specular_sum = share * visible_cosine * specular(roughness, n_dot_l, n_dot_v, l_dot_v)
         radiance[part] = gaussians.albedo[part] / np.pi * (visible_cosine @ flux) + specular_sum @ flux
     return radiance

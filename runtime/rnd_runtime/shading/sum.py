@@ -17,7 +17,7 @@ from rnd_runtime.core.arrays import floats, mask
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.shading.sh import sh_basis
 
-from .brdf import ggx_scalar, roughness_to_alpha
+from .brdf import ggx_scalar, roughness_to_alpha, specular_share_scalar
 from .light import REC709_LUMINANCE, Light, texel_directions, texel_solid_angles
 
 Floats = NDArray[np.float64]
@@ -171,6 +171,7 @@ def _sum_lights(  # type: ignore[no-untyped-def]
         c12, c13, c14, c15 = visibility[i, 12], visibility[i, 13], visibility[i, 14], visibility[i, 15]
         diffuse_r, diffuse_g, diffuse_b = _ZERO, _ZERO, _ZERO
         specular_r, specular_g, specular_b = _ZERO, _ZERO, _ZERO
+        share = specular_share_scalar(albedo[i, 0], albedo[i, 1], albedo[i, 2])
         for k in range(directions.shape[1]):
             lx, ly, lz = directions[0, k], directions[1, k], directions[2, k]
             v = c0 * basis[0, k] + c1 * basis[1, k] + c2 * basis[2, k] + c3 * basis[3, k]
@@ -191,6 +192,6 @@ def _sum_lights(  # type: ignore[no-untyped-def]
             specular_r += reflected * flux[0, k]
             specular_g += reflected * flux[1, k]
             specular_b += reflected * flux[2, k]
-        radiance[i, 0] = max(albedo[i, 0] * _ONE_OVER_PI * diffuse_r + specular_r, _ZERO)
-        radiance[i, 1] = max(albedo[i, 1] * _ONE_OVER_PI * diffuse_g + specular_g, _ZERO)
-        radiance[i, 2] = max(albedo[i, 2] * _ONE_OVER_PI * diffuse_b + specular_b, _ZERO)
+        radiance[i, 0] = max(albedo[i, 0] * _ONE_OVER_PI * diffuse_r + share * specular_r, _ZERO)
+        radiance[i, 1] = max(albedo[i, 1] * _ONE_OVER_PI * diffuse_g + share * specular_g, _ZERO)
+        radiance[i, 2] = max(albedo[i, 2] * _ONE_OVER_PI * diffuse_b + share * specular_b, _ZERO)

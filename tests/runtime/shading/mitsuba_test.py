@@ -99,7 +99,7 @@ def test_a_diffuse_ball_agrees():
     visibility = np.zeros((count, 16))
     visibility[:, 0] = np.sqrt(4 * np.pi)
     images = []
-    for albedo in (0.5, 0.0):  # the specular term is the same in both
+    for albedo in (1.0, 0.5):  # the specular term is the same in both
         arrays = (points, np.zeros((count, 6)), np.ones(count), points, np.full((count, 3), albedo))
         arrays = (*arrays, np.full(count, 0.99), visibility, np.eye(3))
         gaussians = Gaussians(*(np.asarray(a, np.float32) for a in arrays))

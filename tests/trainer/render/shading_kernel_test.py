@@ -28,6 +28,7 @@ def _scene(count: int, texels: int) -> list[torch.Tensor]:
     view = torch.where((normals * view).sum(-1, keepdim=True) < -0.2, -view, view)
     uniform = torch.rand(count, 4, dtype=torch.float64, generator=generator)
     albedo, roughness = 0.8 * uniform[:, :3], 0.05 + 0.97 * uniform[:, 3]  # some beyond the clamp
+    albedo[::4] *= 0.03  # darker than F0
     visibility = torch.rand(count, texels, dtype=torch.float64, generator=generator) - 0.1
     power = torch.rand(texels, 3, dtype=torch.float64, generator=generator)
     return [normals, view, albedo, roughness, visibility, directions, power]

@@ -25,12 +25,20 @@ class Splat:
     albedo: Tensor | None = None  # [H, W, 3] linear, where asked for
 
 
-def splat(posed: PosedGaussians, radiance: Tensor, camera: Camera, *, albedo: bool = False) -> Splat:
-    """Rasterise ``radiance`` [N, 3], the normals and on demand the albedo of posed Gaussians in one pass."""
+def splat(
+    posed: PosedGaussians, radiance: Tensor, camera: Camera, *, albedo: bool = False, cull: float = -1.0
+) -> Splat:
+    """Rasterise ``radiance`` [N, 3], the normals and on demand the albedo of posed Gaussians in one pass.
+
+    Gaussians whose cosine n·v of normal and view is below ``cull`` are left out.
+    """
     rotation = torch.as_tensor(camera.world_to_camera[:3, :3], dtype=torch.float32, device=radiance.device)
-    static = posed.attributes
+    static, opacity = posed.attributes, posed.attributes.opacity
+    if cull > -1:
+        front, _ = visible_towards(posed.normals, posed.means, _eye(camera, radiance.device), cull)
+        opacity = torch.zeros_like(opacity).index_copy(0, front, opacity[front])
     features = torch.cat([radiance, posed.normals @ rotation.T, *([static.albedo] if albedo else [])], dim=-1)
-    image, alpha, _ = rasterize(posed.means, posed.covariances, static.opacity, features, camera)
+    image, alpha, _ = rasterize(posed.means, posed.covariances, opacity, features, camera)
     return Splat(image[..., :3], image[..., 3:6], alpha, image[..., 6:] if albedo else None)
 
 
@@ -42,8 +50,7 @@ def shade_visible(
     The first ``traced_texels`` directions have traced shadows. Images do not train the visibility, except with
     ``visibility="paper"``, where it is one factor per Gaussian, of the direction to the camera.
     """
-    eye = torch.as_tensor(camera.position, dtype=torch.float32, device=posed.means.device)
-    front, view = visible_towards(posed.normals, posed.means, eye)
+    front, view = visible_towards(posed.normals, posed.means, _eye(camera, posed.means.device))
     static, root = posed.attributes, pose.bones[0, :, :3].detach()
     kind = model.config.visibility
     if kind == "pose":
@@ -59,3 +66,8 @@ def shade_visible(
     if kind == "paper":
         shaded = shaded * view_visibility(posed.visibility[front], view, root)
     return torch.zeros_like(posed.means).index_copy(0, front, shaded)
+
+
+def _eye(camera: Camera, device: torch.device) -> Tensor:
+    """Position [3] m of ``camera``."""
+    return torch.as_tensor(camera.position, dtype=torch.float32, device=device)

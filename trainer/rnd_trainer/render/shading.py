@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rnd_runtime.shading.brdf import specular
+from rnd_runtime.shading.brdf import F0, specular
 from rnd_runtime.shading.sh import sh_columns
 from rnd_runtime.shading.shadow import directional_visibility
 
@@ -16,7 +16,7 @@ from .probe import Texels
 from .shading_kernel import FusedShade
 
 BACK_FACING = -0.2
-"""cosine between normal and view below which a Gaussian is not shaded"""
+"""cosine n·v between normal and view below which a Gaussian is not shaded"""
 SHADOW_RADIUS = 1.2
 """radius of a Gaussian in a shadow map, in units of the spacing"""
 
@@ -26,10 +26,10 @@ def sh_basis(directions: Tensor) -> Tensor:
     return torch.stack(sh_columns(*directions.unbind(-1)), dim=-1)
 
 
-def visible_towards(normals: Tensor, means: Tensor, eye: Tensor) -> tuple[Tensor, Tensor]:
-    """Indices of the Gaussians facing ``eye`` [3], and unit directions [n, 3] towards it."""
+def visible_towards(normals: Tensor, means: Tensor, eye: Tensor, least: float = BACK_FACING) -> tuple[Tensor, Tensor]:
+    """Indices of the Gaussians with n·v > ``least`` towards ``eye`` [3], and unit directions [n, 3] towards it."""
     view = torch.nn.functional.normalize(eye - means.detach(), dim=-1)
-    front = ((normals.detach() * view).sum(-1) > BACK_FACING).nonzero()[:, 0]
+    front = ((normals.detach() * view).sum(-1) > least).nonzero()[:, 0]
     return front, view[front]
 
 
@@ -64,7 +64,8 @@ def shade(
     n_dot_l = normals @ texels.directions.T  # [n, K]
     visible_cosine = visibility * n_dot_l.clamp(min=0)
     n_dot_v = (normals * view).sum(-1, keepdim=True)
-    glossy = specular(roughness[:, None], n_dot_l, n_dot_v, view @ texels.directions.T)
+    share = (albedo.amax(dim=-1, keepdim=True) / F0).clamp(max=1)
+    glossy = share * specular(roughness[:, None], n_dot_l, n_dot_v, view @ texels.directions.T)
     radiance = albedo * (visible_cosine @ texels.power) / math.pi + (visible_cosine * glossy) @ texels.power
     return radiance.clamp(min=0)
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rnd_runtime.shading.brdf import COSINE_FLOOR, F0, ROUGHNESS_RANGE
+from rnd_runtime.shading.brdf import COSINE_FLOOR, F0, ROUGHNESS_RANGE, specular_share
 
 CHUNKS = 16
 """blocks of Gaussians with separate sums over texels: deterministic for any number of threads"""
@@ -42,8 +42,9 @@ class FusedShade(torch.autograd.Function):
         )
         half_squared = np.maximum(2 + 2 * (v @ towards.T), np.float32(1e-8))  # zero where light and camera are opposite
         ctx.inputs = (n, v, gamma, visible, towards.T.copy(), strength.T.copy(), half_squared)
-        ctx.diffuse, specular = _sum(*ctx.inputs)
-        radiance = ctx.albedo * ctx.diffuse * np.float32(1 / np.pi) + specular
+        ctx.diffuse, ctx.specular = _sum(*ctx.inputs)
+        ctx.share = specular_share(*ctx.albedo.T)[:, None].astype(np.float32)
+        radiance = ctx.albedo * ctx.diffuse * np.float32(1 / np.pi) + ctx.share * ctx.specular
         ctx.lit = radiance > 0
         return torch.from_numpy(np.maximum(radiance, 0))
 
@@ -51,8 +52,11 @@ class FusedShade(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         incoming = np.ascontiguousarray(grad.numpy() * ctx.lit)
-        grad_normals, grad_roughness, grad_power = _sum_backward(*ctx.inputs, ctx.albedo, incoming)
+        grad_normals, grad_roughness, grad_power = _sum_backward(*ctx.inputs, ctx.albedo, ctx.share[:, 0], incoming)
         grad_albedo = incoming * ctx.diffuse * np.float32(1 / np.pi)
+        largest = np.arange(len(incoming)), ctx.albedo.argmax(1)
+        grad_share = (incoming * ctx.specular).sum(1) * np.float32(1 / F0)
+        grad_albedo[largest] += np.where(ctx.share[:, 0] < 1, grad_share, np.float32(0))
         results = (grad_normals, None, grad_albedo, grad_roughness, None, None, grad_power)
         return tuple(None if r is None else torch.from_numpy(r) for r in results)
 
@@ -127,7 +131,7 @@ def _sum(normals, view, roughness, visibility, directions, power, half_squared):
 
 
 @numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
-def _sum_backward(normals, view, roughness, visibility, directions, power, half_squared, albedo, grad):
+def _sum_backward(normals, view, roughness, visibility, directions, power, half_squared, albedo, share, grad):
     """Gradients by normals [n, 3], roughness [n] and power [K, 3], given that of the radiance."""
     count, texels = visibility.shape
     zero, over_pi = np.float32(0), np.float32(1 / np.pi)
@@ -142,6 +146,7 @@ def _sum_backward(normals, view, roughness, visibility, directions, power, half_
             alpha_squared = _alpha_squared(roughness[i])
             g0, g1, g2 = grad[i, 0], grad[i, 1], grad[i, 2]
             a0, a1, a2 = g0 * albedo[i, 0] * over_pi, g1 * albedo[i, 1] * over_pi, g2 * albedo[i, 2] * over_pi
+            g0, g1, g2 = g0 * share[i], g1 * share[i], g2 * share[i]
             gx = gy = gz = by_view_sum = by_alpha_sum = zero
             for k in range(texels):
                 lx, ly, lz = directions[0, k], directions[1, k], directions[2, k]

@@ -8,5 +8,5 @@ vec3 sky() {
     vec3 specular_sum = vec3(sh_dot(shining, ambient[0]), sh_dot(shining, ambient[1]), sh_dot(shining, ambient[2]));
     vec3 diffuse = vec3(sh_dot(open, ambient[0]), sh_dot(open, ambient[1]), sh_dot(open, ambient[2]));
     float occlusion = max(sh_dot(open, coefficients), 0.0);
-    return occlusion * (albedo * max(diffuse, 0.0) + lobe.energy * max(specular_sum, 0.0));
+    return occlusion * (albedo * max(diffuse, 0.0) + specular_share * lobe.energy * max(specular_sum, 0.0));
 }

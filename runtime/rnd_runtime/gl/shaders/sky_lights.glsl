@@ -23,5 +23,5 @@ vec3 sky() {
         scattered += visible_irradiance;
         reflected += visible_irradiance * ggx(alpha2, n_dot_l, n_dot_v, dot(across, across) / half_squared, half_squared);
     }
-    return max(ONE_OVER_PI * albedo * scattered + reflected, 0.0);
+    return max(ONE_OVER_PI * albedo * scattered + specular_share * reflected, 0.0);
 }

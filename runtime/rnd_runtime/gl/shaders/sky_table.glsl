@@ -44,5 +44,5 @@ vec3 sky() {
     octahedral_cell(normal, DIFFUSE_SIZE, cell, place);
     vec3 upper = mix(irradiance_at(cell), irradiance_at(cell + ivec2(1, 0)), place.x);
     vec3 lower = mix(irradiance_at(cell + ivec2(0, 1)), irradiance_at(cell + ivec2(1, 1)), place.x);
-    return max(ONE_OVER_PI * albedo * mix(upper, lower, place.y) + lobe.energy * open * specular_sum, 0.0);
+    return max(ONE_OVER_PI * albedo * mix(upper, lower, place.y) + specular_share * lobe.energy * open * specular_sum, 0.0);
 }

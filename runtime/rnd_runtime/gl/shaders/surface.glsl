@@ -11,7 +11,7 @@ uniform mat4 turn[8];          // root's frame → light's frame, of the SH coef
 vec3 mean_world, normal_world;
 float disc_radius;
 vec3 normal, view, albedo;
-float roughness, n_dot_v;
+float roughness, n_dot_v, specular_share;
 mat4 coefficients;  // of the visibility, in the light's frame
 float checksum;     // no number where anything of the Gaussian is none; max() and clamp() may lose that
 
@@ -23,6 +23,7 @@ void load_surface(int index) {
     normal_world = texelFetch(normals, place, 0).xyz;
     albedo = material.rgb;
     roughness = material.a;
+    specular_share = min(max(max(albedo.r, albedo.g), albedo.b) / F0, 1.0);
 
     vec3 to_eye = world_to_light * (eye - mean_world);
     view = to_eye / max(length(to_eye), TINY);

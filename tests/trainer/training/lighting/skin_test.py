@@ -7,6 +7,7 @@ import pytest
 
 from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.shading.light import REC709_LUMINANCE
+from rnd_trainer.model.model import ALBEDO_RANGE
 from rnd_trainer.model.template import sample_template
 from rnd_trainer.training.lighting import skin
 from support.paths import ASSETS
@@ -43,6 +44,13 @@ def test_without_skin_only_the_level_changes() -> None:
     assert np.ptp(gain) == pytest.approx(0, abs=1e-12)
     mean = (0.5 * true * gain @ REC709_LUMINANCE).mean()
     assert mean == pytest.approx(skin.BODY_LUMINANCE)
+
+
+def test_a_bright_shirt_over_black_trousers_is_no_brighter_than_a_material() -> None:
+    rng = np.random.default_rng(3)
+    true = np.where(np.arange(200)[:, None] < 140, 0.01, [0.75, 0.1, 0.2]) * rng.uniform(0.9, 1.0, (200, 1))
+    gain = skin.likely_gain(2 * true, np.ones(len(true)), [], None)
+    assert np.quantile((2 * true * gain).max(1), skin.BRIGHT_SHARE) == pytest.approx(ALBEDO_RANGE[1])
 
 
 def test_gloves_are_no_skin() -> None:

@@ -54,9 +54,9 @@ def baked_light(subject: Subject) -> Result:
     for truth, camera, time in subject.observed(frames, subject.few(6, 25)):
         assert truth.albedo_srgb is not None
         posed = subject.avatar.pose(capture.motion, time)
-        white, black = (np.full_like(posed.albedo, level) for level in (1, 0))
-        irradiance = shader.shade(replace(posed, albedo=white), camera.position)
-        irradiance -= shader.shade(replace(posed, albedo=black), camera.position)
+        once, twice = (np.full_like(posed.albedo, level) for level in (1, 2))  # the specular part cancels
+        irradiance = shader.shade(replace(posed, albedo=twice), camera.position)
+        irradiance -= shader.shade(replace(posed, albedo=once), camera.position)
         features = np.concatenate([posed.albedo, irradiance], axis=1).astype(np.float32)
         raster = rasterize(posed.means, posed.covariances, posed.opacities, features, camera, depth=False)
         inside = (truth.mask > 0.99) & (raster.alpha > 0.99)

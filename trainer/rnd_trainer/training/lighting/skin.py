@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.shading.light import REC709_LUMINANCE
+from rnd_trainer.model.model import ALBEDO_RANGE
 from rnd_trainer.model.template import Template
 
 Floats = NDArray[np.float64]
@@ -32,6 +33,8 @@ SKIN_LUMINANCE, SKIN_LUMINANCE_DEVIATION = 0.28, 0.5
 """median reflectance of skin over people, and the deviation of its logarithm"""
 BODY_LUMINANCE, BODY_DEVIATION = 0.28, 0.35
 """the same of a clothed person's mean: geometric mean and spread of the seven development subjects"""
+BRIGHT_SHARE = 0.95
+"""share of the points that are at most as bright as the brightest material; the others may be errors or highlights"""
 MIN_POINTS = 8
 """plausible points below which nothing is said"""
 TONES = (0.40, 0.34, 0.27, 0.20, 0.14, 0.08)
@@ -76,6 +79,8 @@ def _with_children(skeleton: Skeleton, joint: int) -> list[int]:
 def likely_gain(albedo: Floats, weight: Floats, skin: Sequence[int] | NDArray[np.int64], tone: float | None) -> Floats:
     """The factor [3] on all albedos that makes them likeliest, by their mean and by skin where it was seen.
 
+    It leaves the brightest within the range of materials: on a pink shirt that is overexposed the mean is no guide.
+
     Args:
         albedo: [P, 3] of points under a light that is grey in the mean.
         weight: [P] of their mean, 0 where a point was not seen.
@@ -98,4 +103,6 @@ def likely_gain(albedo: Floats, weight: Floats, skin: Sequence[int] | NDArray[np
         expected, deviation = (SKIN_LUMINANCE, SKIN_LUMINANCE_DEVIATION) if tone is None else (tone, TONE_DEVIATION)
         level.append((np.log(expected) - np.median(np.log(of_skin[plausible] @ to_luminance)), deviation))
     shifts, deviations = np.array(level).T
-    return np.exp(np.average(shifts, weights=1 / deviations**2)) * colour
+    gain = np.exp(np.average(shifts, weights=1 / deviations**2)) * colour
+    brightest = np.quantile((albedo[weight > 0] * gain).max(1), BRIGHT_SHARE)
+    return gain * min(1.0, ALBEDO_RANGE[1] / brightest)

@@ -1,6 +1,7 @@
 // A light of sixteen SH coefficients times each Gaussian's occlusion (rnd_runtime/shading/ambient.py).
 
 import { COSINE_LOBE, PROBE_SHAPE, SH_DEGREES } from "../constants.js";
+import { specularShare } from "./brdf.js";
 import { downsize, texelDirections, texelSolidAngles } from "./light.js";
 import { lobeAt } from "./lobe.js";
 import { shBasis, shRotation } from "./sh.js";
@@ -37,13 +38,14 @@ export function shadeAmbient(coefficients, { means, normals, albedo, roughness, 
       atNormal[j] *= COSINE_LOBE[j];
       occlusion += atNormal[j] * visibility[16 * i + j];
     }
+    const energy = lobe[0] * specularShare(albedo, i);
     for (let c = 0; c < 3; c++) {
       let diffuse = 0, specular = 0;
       for (let j = 0; j < 16; j++) {
         specular += (j < 1 ? 1 : lobe[4 + SH_DEGREES[j]]) * atLobe[j] * light[3 * j + c];
         if (j < 9) diffuse += atNormal[j] * light[3 * j + c];
       }
-      radiance[3 * i + c] = Math.max(occlusion, 0) * (albedo[3 * i + c] * Math.max(diffuse, 0) + lobe[0] * Math.max(specular, 0));
+      radiance[3 * i + c] = Math.max(occlusion, 0) * (albedo[3 * i + c] * Math.max(diffuse, 0) + energy * Math.max(specular, 0));
     }
   }
 }

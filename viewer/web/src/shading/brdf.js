@@ -4,6 +4,10 @@ import { COSINE_FLOOR, F0, ROUGHNESS_RANGE } from "../constants.js";
 
 export const clampRoughness = (roughness) => Math.min(Math.max(roughness, ROUGHNESS_RANGE[0]), ROUGHNESS_RANGE[1]);
 
+/** Share of the specular term that Gaussian `i` of `albedo` keeps: black is a cavity, or crushed by the camera. */
+export const specularShare = (albedo, i) =>
+  Math.min(Math.max(albedo[3 * i], albedo[3 * i + 1], albedo[3 * i + 2]) / F0, 1);
+
 /** D·F·G / (4 n·l n·v) from α², cosines, sin²θ_h and |l + v|². */
 export function ggx(alphaSquared, nDotL, nDotV, sineSquared, halfSquared) {
   const lobe = sineSquared + alphaSquared * (1 - sineSquared);

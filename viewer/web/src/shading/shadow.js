@@ -5,7 +5,7 @@ import {
   SOFTNESS, TURNED_AWAY,
 } from "../constants.js";
 import { cross, unit } from "../rotations.js";
-import { clampRoughness, ggx } from "./brdf.js";
+import { clampRoughness, ggx, specularShare } from "./brdf.js";
 
 /** Add to `radiance` [count·3] that of `suns` ({direction in the root's frame, irradiance, spread}). */
 export function addSuns(suns, gaussians, count, eye, covarianceScale, radiance) {
@@ -123,7 +123,7 @@ function shadeSun(sun, { means, normals, albedo, roughness }, count, eye, visibi
     const cx = ny * hz - nz * hy, cy = nz * hx - nx * hz, cz = nx * hy - ny * hx;
     const sineSquared = (cx * cx + cy * cy + cz * cz) / halfSquared;
     const alpha = clampRoughness(roughness[i]) ** 2;
-    const specular = ggx(Math.min(alpha * alpha + spread / Math.sqrt(halfSquared), 1), nDotL, nDotV, sineSquared, halfSquared);
+    const specular = specularShare(albedo, i) * ggx(Math.min(alpha * alpha + spread / Math.sqrt(halfSquared), 1), nDotL, nDotV, sineSquared, halfSquared);
     for (let c = 0; c < 3; c++) radiance[3 * i + c] += facing * visibleCosine * (albedo[3 * i + c] / Math.PI + specular) * sun.irradiance[c];
   }
 }

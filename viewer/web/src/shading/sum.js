@@ -1,7 +1,7 @@
 // The sum over distant lights with the full BRDF and the visibility of each (rnd_runtime/shading/sum.py).
 
 import { CUT_TEXELS, HALF_FLOOR, PROBE_SHAPE } from "../constants.js";
-import { clampRoughness, ggx } from "./brdf.js";
+import { clampRoughness, ggx, specularShare } from "./brdf.js";
 import { downsize, luminance, texelDirections, texelSolidAngles } from "./light.js";
 import { rotate } from "../rotations.js";
 import { shBasis } from "./sh.js";
@@ -90,7 +90,7 @@ export function shadeLights(lights, { means, normals, albedo, roughness, visibil
     vy /= distance;
     vz /= distance;
     const nDotV = nx * vx + ny * vy + nz * vz, alphaSquared = clampRoughness(roughness[i]) ** 4;
-    const diffuse = [0, 0, 0], specular = [0, 0, 0];
+    const share = specularShare(albedo, i), diffuse = [0, 0, 0], specular = [0, 0, 0];
     for (let k = 0; k < K; k++) {
       const lx = toward[3 * k], ly = toward[3 * k + 1], lz = toward[3 * k + 2], nDotL = nx * lx + ny * ly + nz * lz;
       if (!(nDotL > 0)) continue;
@@ -105,6 +105,6 @@ export function shadeLights(lights, { means, normals, albedo, roughness, visibil
         specular[c] += reflected * flux[3 * k + c];
       }
     }
-    for (let c = 0; c < 3; c++) radiance[3 * i + c] = Math.max(albedo[3 * i + c] / Math.PI * diffuse[c] + specular[c], 0);
+    for (let c = 0; c < 3; c++) radiance[3 * i + c] = Math.max(albedo[3 * i + c] / Math.PI * diffuse[c] + share * specular[c], 0);
   }
 }

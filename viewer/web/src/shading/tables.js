@@ -1,6 +1,7 @@
 // Shading by tables over the normal that depend on the light alone (rnd_runtime/shading/lookup.py).
 
 import { DIFFUSE_SIZE as DIFFUSE, LOBE_WIDTHS, PROBE_SHAPE, SH_DEGREES, SPECULAR_SIZE as SPECULAR } from "../constants.js";
+import { specularShare } from "./brdf.js";
 import { downsize, texelDirections, texelSolidAngles } from "./light.js";
 import { lobeAt } from "./lobe.js";
 import { transposed } from "../rotations.js";
@@ -102,6 +103,7 @@ export function shadeSky(sky, gaussians, count, eye, lightToRoot, radiance) {
     shBasis(r[0] * mx + r[1] * my + r[2] * mz, r[3] * mx + r[4] * my + r[5] * mz, r[6] * mx + r[7] * my + r[8] * mz, basis);
     let visible = visibility[16 * i] * basis[0];  // averaged over the lobe
     for (let j = 1; j < 16; j++) visible += lobe[4 + SH_DEGREES[j]] * visibility[16 * i + j] * basis[j];
+    const reflected = lobe[0] * specularShare(albedo, i) * Math.max(visible, 0);
     const low = Math.min(Math.floor(level), LOBE_WIDTHS.length - 2), up = level - low;
     octahedralCell(mx, my, mz, SPECULAR, cell);
     octahedralCell(n[0], n[1], n[2], DIFFUSE, node);
@@ -110,7 +112,7 @@ export function shadeSky(sky, gaussians, count, eye, lightToRoot, radiance) {
     for (let channel = 0; channel < 3; channel++) {
       const corner = 3 * cell[0] + channel + low * mapSize;
       const lower = bilinear(specular, corner, cell[1], cell[2]), upper = bilinear(specular, corner + mapSize, cell[1], cell[2]);
-      const specularRadiance = lobe[0] * Math.max(visible, 0) * (lower + up * (upper - lower));
+      const specularRadiance = reflected * (lower + up * (upper - lower));
       let irradiance = 0;
       for (let j = 16 * i; j < 16 * i + 16; j++)
         irradiance += visibility[j] * (w00 * diffuse[a++] + w01 * diffuse[b++] + w10 * diffuse[c++] + w11 * diffuse[d++]);
