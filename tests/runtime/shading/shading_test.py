@@ -118,6 +118,7 @@ def test_a_sun_casts_the_shadow_of_what_stands_before_it():
     grid = np.stack(np.meshgrid(np.linspace(-3, 3, 80), [0.0], np.linspace(-3, 3, 80)), -1).reshape(-1, 3)
     floor = replace(ball(len(grid), open_sky=True), means=grid - [0, 2, 0], normals=grid * 0 + [0, 1, 0])
     floor = replace(floor, covariances=np.tile([1e-3, 0, 0, 1e-3, 0, 1e-3], (len(grid), 1)))
+    floor = replace(floor, albedo=np.full(grid.shape, 0.4))  # of black the sky's reflection is all there is
     scene = replace(
         floor,
         **{
