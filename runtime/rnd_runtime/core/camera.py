@@ -66,6 +66,12 @@ class Camera:
         scaled = seen[:, :2] / np.where(depths > 0, depths, 1)[:, None]
         return scaled * self.K[[0, 1], [0, 1]] + self.K[:2, 2], depths
 
+    def box(self, pixels: Floats) -> tuple[int, int, int, int]:
+        """The part of the image that ``pixels`` [N, 2] span: first column and row, and those after the last."""
+        size = np.array([self.width, self.height])
+        low, high = (np.clip(edge, 0, size) for edge in (np.floor(pixels.min(axis=0)), np.ceil(pixels.max(axis=0))))
+        return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another resolution; intrinsics scale with the image."""
         scale = np.diag([width / self.width, height / self.height, 1.0])

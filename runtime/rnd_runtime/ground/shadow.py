@@ -104,8 +104,7 @@ class Shadow:
         pixels, depths = camera.project(corners)
         if depths.min() < NEAR:
             return slice(0, camera.height), slice(0, camera.width)
-        low, high, size = np.floor(pixels.min(axis=0)), np.ceil(pixels.max(axis=0)), (camera.width, camera.height)
-        (left, top), (right, bottom) = (np.clip(edge, 0, size).astype(int).tolist() for edge in (low, high))
+        left, top, right, bottom = camera.box(pixels)
         return slice(top, bottom), slice(left, right)
 
     def share_at(self, points: Floats) -> Floats:

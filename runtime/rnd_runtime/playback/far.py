@@ -118,10 +118,7 @@ def extent(camera: Camera, points: NDArray[np.floating[Any]]) -> Extent:
     pixels, corner_depths = camera.project(corners)
     if not corner_depths.min() >= NEAR:
         return everywhere
-    size = np.array([camera.width, camera.height])
-    (left, top), (right, bottom) = (
-        np.clip(edge, 0, size).astype(int).tolist() for edge in (np.floor(pixels.min(0)), np.ceil(pixels.max(0)))
-    )
+    left, top, right, bottom = camera.box(pixels)
     factor = min(math.ceil(MIN_PIXELS_PER_METRE * nearest / min(camera.K[0, 0], camera.K[1, 1])), MAX_FACTOR)
     in_image = left < right and top < bottom
     return Extent(nearest, farthest, max(factor, 1) if in_image else 1, left, top, right, bottom)

@@ -108,8 +108,7 @@ def _shade_sixteen(indices, visibility, root_rotation, tables, scratch, rows, co
     visibility_in_lanes(indices, visibility, rows, columns)
     broken = nan_lanes(scratch, columns)
 
-    albedo = load3(scratch, ALBEDO)
-    energy = energy * specular_share_lanes(albedo[0], albedo[1], albedo[2])
+    energy = energy * specular_share_lanes(*load3(scratch, ALBEDO))
     occlusion = lanes(ZERO)
     for j in range(9):
         occlusion += COSINE_LOBE[j] * (at_normal[j] * load(columns, j * WIDTH))

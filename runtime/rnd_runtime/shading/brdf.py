@@ -79,7 +79,7 @@ def _specular_share(at_least: Callable[[Any, Any], Any], number: Callable[[float
     return specular_share
 
 
-specular_share = _specular_share(np.maximum, float)
+specular_share = _specular_share(lambda x, low: x.clip(min=low), float)  # numpy or torch
 specular_share_scalar = numba.njit(_specular_share(max, np.float32), error_model="numpy")
 specular_share_lanes = numba.njit(_specular_share(at_least, np.float32), error_model="numpy")
 ggx = _ggx(lambda x: x**0.5, lambda x, low: x.clip(min=low), float)  # numpy or torch

@@ -88,7 +88,7 @@ def _light_sixteen(indices, visibility, lights, scratch):  # type: ignore[no-unt
     alpha = at_least(clamped(load(scratch, ROUGHNESS), _ROUGHNESS_HIGH), ROUGHNESS_LOW)
     alpha = alpha * alpha
     albedo = load3(scratch, ALBEDO)
-    share = specular_share_lanes(albedo[0], albedo[1], albedo[2])
+    share = specular_share_lanes(*albedo)
     red, green, blue = lanes(ZERO), lanes(ZERO), lanes(ZERO)
     for light in range(len(lights.directions)):
         for k in range(WIDTH):

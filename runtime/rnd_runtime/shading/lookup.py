@@ -92,8 +92,7 @@ def _shade_sixteen(indices, visibility, rotations, tables, scratch, rows, column
     shrink = load3(columns, 4 * WIDTH)
     visibility_in_lanes(indices, visibility, rows, columns)
     broken = nan_lanes(scratch, columns)
-    albedo = load3(scratch, ALBEDO)
-    energy = energy * specular_share_lanes(albedo[0], albedo[1], albedo[2])
+    energy = energy * specular_share_lanes(*load3(scratch, ALBEDO))
     energy = energy * at_least(_mean_visibility(root_to_light, mean, shrink, columns), ZERO)
 
     _octahedral_cell(mean[0], mean[1], mean[2], SPECULAR_SIZE, scratch)

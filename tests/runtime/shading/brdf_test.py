@@ -2,7 +2,17 @@ import numba
 import numpy as np
 import pytest
 
-from rnd_runtime.shading.brdf import F0, LARGEST_ALBEDO, ROUGHNESS_RANGE, ggx, ggx_scalar, roughness_to_alpha, specular
+from rnd_runtime.shading.brdf import (
+    F0,
+    LARGEST_ALBEDO,
+    ROUGHNESS_RANGE,
+    ggx,
+    ggx_scalar,
+    roughness_to_alpha,
+    specular,
+    specular_share,
+    specular_share_scalar,
+)
 
 ROUGHNESSES = [0.0, 0.09, 0.2, 0.4, 0.6, 0.8, 0.99, 1.0]
 COSINES = [1.0, 0.9, 0.5, 0.2, 0.05, 0.01, 1e-3]
@@ -64,6 +74,13 @@ def test_it_is_the_formula_of_the_papers():
     expected = [textbook_specular(*row) for row in zip(roughness, lights, views)]
     cosines = lights[:, 2], views[:, 2], (lights * views).sum(-1)
     np.testing.assert_allclose(specular(roughness, *cosines), expected, rtol=1e-9)
+
+
+def test_an_albedo_below_f0_keeps_its_share_of_the_specular_term():
+    albedo = np.array([[0, 0, 0], [0, F0 / 4, F0 / 2], [F0, 0, 0], [0.1, 0.5, 0.8]])
+    shares = [0, 0.5, 1, 1]
+    np.testing.assert_allclose(specular_share(*albedo.T), shares, rtol=1e-12)
+    np.testing.assert_allclose([specular_share_scalar(*row) for row in albedo.astype(np.float32)], shares, rtol=1e-6)
 
 
 @pytest.mark.parametrize("cosine", COSINES)

@@ -35,7 +35,7 @@ def splat(
     rotation = torch.as_tensor(camera.world_to_camera[:3, :3], dtype=torch.float32, device=radiance.device)
     static, opacity = posed.attributes, posed.attributes.opacity
     if cull > -1:
-        front, _ = visible_towards(posed.normals, posed.means, _eye(camera, radiance.device), cull)
+        front, _ = visible_towards(posed.normals, posed.means, camera, cull)
         opacity = torch.zeros_like(opacity).index_copy(0, front, opacity[front])
     features = torch.cat([radiance, posed.normals @ rotation.T, *([static.albedo] if albedo else [])], dim=-1)
     image, alpha, _ = rasterize(posed.means, posed.covariances, opacity, features, camera)
@@ -50,7 +50,7 @@ def shade_visible(
     The first ``traced_texels`` directions have traced shadows. Images do not train the visibility, except with
     ``visibility="paper"``, where it is one factor per Gaussian, of the direction to the camera.
     """
-    front, view = visible_towards(posed.normals, posed.means, _eye(camera, posed.means.device))
+    front, view = visible_towards(posed.normals, posed.means, camera)
     static, root = posed.attributes, pose.bones[0, :, :3].detach()
     kind = model.config.visibility
     if kind == "pose":
@@ -66,8 +66,3 @@ def shade_visible(
     if kind == "paper":
         shaded = shaded * view_visibility(posed.visibility[front], view, root)
     return torch.zeros_like(posed.means).index_copy(0, front, shaded)
-
-
-def _eye(camera: Camera, device: torch.device) -> Tensor:
-    """Position [3] m of ``camera``."""
-    return torch.as_tensor(camera.position, dtype=torch.float32, device=device)

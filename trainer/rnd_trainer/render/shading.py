@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rnd_runtime.shading.brdf import F0, specular
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.shading.brdf import specular, specular_share
 from rnd_runtime.shading.sh import sh_columns
 from rnd_runtime.shading.shadow import directional_visibility
 
@@ -26,8 +27,11 @@ def sh_basis(directions: Tensor) -> Tensor:
     return torch.stack(sh_columns(*directions.unbind(-1)), dim=-1)
 
 
-def visible_towards(normals: Tensor, means: Tensor, eye: Tensor, least: float = BACK_FACING) -> tuple[Tensor, Tensor]:
-    """Indices of the Gaussians with n·v > ``least`` towards ``eye`` [3], and unit directions [n, 3] towards it."""
+def visible_towards(
+    normals: Tensor, means: Tensor, camera: Camera, least: float = BACK_FACING
+) -> tuple[Tensor, Tensor]:
+    """Indices of the Gaussians with n·v > ``least``, and unit directions [n, 3] towards the camera."""
+    eye = torch.as_tensor(camera.position, dtype=means.dtype, device=means.device)
     view = torch.nn.functional.normalize(eye - means.detach(), dim=-1)
     front = ((normals.detach() * view).sum(-1) > least).nonzero()[:, 0]
     return front, view[front]
@@ -64,8 +68,8 @@ def shade(
     n_dot_l = normals @ texels.directions.T  # [n, K]
     visible_cosine = visibility * n_dot_l.clamp(min=0)
     n_dot_v = (normals * view).sum(-1, keepdim=True)
-    share = (albedo.amax(dim=-1, keepdim=True) / F0).clamp(max=1)
-    glossy = share * specular(roughness[:, None], n_dot_l, n_dot_v, view @ texels.directions.T)
+    glossy = specular(roughness[:, None], n_dot_l, n_dot_v, view @ texels.directions.T)
+    glossy = specular_share(*albedo.split(1, dim=-1)) * glossy
     radiance = albedo * (visible_cosine @ texels.power) / math.pi + (visible_cosine * glossy) @ texels.power
     return radiance.clamp(min=0)
 

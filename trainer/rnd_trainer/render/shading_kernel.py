@@ -43,7 +43,7 @@ class FusedShade(torch.autograd.Function):
         half_squared = np.maximum(2 + 2 * (v @ towards.T), np.float32(1e-8))  # zero where light and camera are opposite
         ctx.inputs = (n, v, gamma, visible, towards.T.copy(), strength.T.copy(), half_squared)
         ctx.diffuse, ctx.specular = _sum(*ctx.inputs)
-        ctx.share = specular_share(*ctx.albedo.T)[:, None].astype(np.float32)
+        ctx.share = specular_share(*ctx.albedo.T)[:, None]
         radiance = ctx.albedo * ctx.diffuse * np.float32(1 / np.pi) + ctx.share * ctx.specular
         ctx.lit = radiance > 0
         return torch.from_numpy(np.maximum(radiance, 0))

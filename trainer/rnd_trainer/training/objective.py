@@ -94,7 +94,7 @@ class Objective:
         if estimate is not None:
             normals, known = (x.to(device) for x in estimate)
             terms["normal"] = config.weight_normal * ((rendered.normals - normals).abs() * known).mean()
-        elif config.model.learned_normals:
+        else:
             terms["tilt"] = config.weight_tilt * (posed.attributes.normals - model.rest_normals).square().mean()
         if guess is not None and rendered.albedo is not None:
             guessed, known = (x.to(device) for x in guess)

@@ -37,8 +37,8 @@ vec3 direct() {
         float half_squared = max(dot(h, h), TINY);
         vec3 across = cross(normal, h);
         float widened = min(alpha_squared() + light_blurs[light] / sqrt(half_squared), 1.0);
-        float specular_term = specular_share * ggx(widened, n_dot_l, n_dot_v, dot(across, across) / half_squared, half_squared);
-        sum += visible_cosine * (ONE_OVER_PI * albedo + specular_term) * light_irradiances[light];
+        float specular_term = ggx(widened, n_dot_l, n_dot_v, dot(across, across) / half_squared, half_squared);
+        sum += visible_cosine * (ONE_OVER_PI * albedo + specular_share * specular_term) * light_irradiances[light];
     }
     return sum;
 }

@@ -56,6 +56,8 @@ below which there is none; of several lights their share. The weakest true ones 
 real videos, whose bodies and poses err, one that is not there has up to 4.1e-3"""
 MIN_GAIN = 0.01
 """decrease by every further one, relative to the squared error; of several lights their share"""
+NOISE_FLOOR = 2e-3
+"""squared error relative to the energy at which the search ends; that of real captures is ten times as large"""
 CANDIDATES = 24
 """directions with the largest gradient that are fitted before one is chosen"""
 ROUND_OFF = 1e-5
@@ -270,7 +272,8 @@ def _search(quadratic: Quadratic, above: NDArray[np.bool_]) -> list[int]:
     before, intensity = quadratic.fit(columns)
     sky = slice(0, skies)
     energy = float(np.einsum("qc,qr,rc", intensity, quadratic.irradiance_gram[sky, sky], intensity))
-    while len(columns) < min(skies + MAX_LIGHTS * lights, len(quadratic.irradiance)):
+    noise = NOISE_FLOOR / lights * energy
+    while len(columns) < min(skies + MAX_LIGHTS * lights, len(quadratic.irradiance)) and before > noise:
         gain = quadratic.gains(columns, intensity)
         gain[columns] = -np.inf
         gain[skies:][~above] = -np.inf

@@ -123,7 +123,8 @@ function shadeSun(sun, { means, normals, albedo, roughness }, count, eye, visibi
     const cx = ny * hz - nz * hy, cy = nz * hx - nx * hz, cz = nx * hy - ny * hx;
     const sineSquared = (cx * cx + cy * cy + cz * cz) / halfSquared;
     const alpha = clampRoughness(roughness[i]) ** 2;
-    const specular = specularShare(albedo, i) * ggx(Math.min(alpha * alpha + spread / Math.sqrt(halfSquared), 1), nDotL, nDotV, sineSquared, halfSquared);
-    for (let c = 0; c < 3; c++) radiance[3 * i + c] += facing * visibleCosine * (albedo[3 * i + c] / Math.PI + specular) * sun.irradiance[c];
+    const specular = ggx(Math.min(alpha * alpha + spread / Math.sqrt(halfSquared), 1), nDotL, nDotV, sineSquared, halfSquared);
+    const reflected = specularShare(albedo, i) * specular;
+    for (let c = 0; c < 3; c++) radiance[3 * i + c] += facing * visibleCosine * (albedo[3 * i + c] / Math.PI + reflected) * sun.irradiance[c];
   }
 }
