@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from rnd_runtime.core.camera import Camera
 from rnd_trainer.losses.consistency import GRAZING, PITCH, YAW, consistency_loss, covisible, project, virtual_camera
 from rnd_trainer.losses.perceptual import Perceptual, load_perceptual
 from rnd_trainer.losses.perceptual_nets import BACKBONES
-from rnd_trainer.model.model import Attributes, PosedGaussians
+from support.ball import front_camera, splat_ball
 
 
 @pytest.fixture(scope="module")
@@ -28,21 +27,8 @@ def perceptual(tmp_path_factory) -> Perceptual:
     return load_perceptual(path)
 
 
-def _ball(count: int = 4000, radius: float = 0.2) -> PosedGaussians:
-    generator = torch.Generator().manual_seed(0)
-    normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
-    size = (0.008**2) * torch.tensor([1.0, 0, 0, 1.0, 0, 1.0])
-    one = torch.ones(count)
-    static = Attributes(0.99 * one, *(normals,) * 6, one, normals)
-    return PosedGaussians(radius * normals, size.expand(count, 6).contiguous(), normals, one, one, one, static)
-
-
-def _camera() -> Camera:
-    return Camera.look_at([0, 0.1, 1.5], [0, 0, 0], width=160, height=160, fov_y=0.4)
-
-
 def test_the_virtual_camera_keeps_its_distance_and_stays_in_range() -> None:
-    generator, camera, centre = torch.Generator().manual_seed(0), _camera(), torch.tensor([0.1, 0.0, 0.2])
+    generator, camera, centre = torch.Generator().manual_seed(0), front_camera(), torch.tensor([0.1, 0.0, 0.2])
     before = camera.position - centre.numpy()
     limit = math.hypot(YAW, PITCH) + 1e-9
     for _ in range(20):
@@ -55,7 +41,7 @@ def test_the_virtual_camera_keeps_its_distance_and_stays_in_range() -> None:
 
 
 def test_covisible_points_are_those_in_front_of_both() -> None:
-    ball, camera = _ball(), _camera()
+    ball, camera = splat_ball(), front_camera()
     other = virtual_camera(camera, torch.zeros(3), torch.Generator().manual_seed(3))
     shared = covisible(ball, camera, other, 4000)
     facing = torch.ones(4000, dtype=torch.bool)

@@ -51,7 +51,7 @@ def virtual_camera(camera: Camera, centre: Tensor, generator: torch.Generator) -
 
 def covisible(posed: PosedGaussians, first: Camera, second: Camera, count: int) -> Tensor:
     """Indices of those among the first ``count`` Gaussians that both cameras see."""
-    seen = [in_sight(posed, camera, count, facing=GRAZING, occlusion=OCCLUSION)[0] for camera in (first, second)]
+    seen = [in_sight(posed, camera, count, facing=GRAZING, occlusion=OCCLUSION).visible for camera in (first, second)]
     return torch.from_numpy(np.flatnonzero(seen[0] & seen[1])).to(posed.means.device)
 
 

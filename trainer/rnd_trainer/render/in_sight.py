@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -11,22 +13,32 @@ from rnd_runtime.raster.cpu import rasterize
 from rnd_trainer.model.model import PosedGaussians
 
 
+class Sight(NamedTuple):
+    """What a camera sees of Gaussians: whether it sees them, their pixels, and the surface there.
+
+    Attributes:
+        visible: [count].
+        pixels: [count, 2] x, y with centres at +0.5; 0 outside the frame.
+        normals: [count, 3] unit, of the splatted surface at the pixel. Near an outline a Gaussian lies behind surface
+            that faces the camera more than it does, by 15° where n·v is 0.4.
+    """
+
+    visible: NDArray[np.bool_]
+    pixels: NDArray[np.float64]
+    normals: NDArray[np.float32]
+
+
 @torch.no_grad()
-def in_sight(
-    posed: PosedGaussians, camera: Camera, count: int, *, facing: float, occlusion: float
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Visibility [count] of the first ``count`` Gaussians, and their pixels [count, 2].
+def in_sight(posed: PosedGaussians, camera: Camera, count: int, *, facing: float, occlusion: float) -> Sight:
+    """What ``camera`` sees of the first ``count`` Gaussians.
 
     Args:
         facing: smallest cosine between normal and direction to the camera.
         occlusion: distance behind the first surface up to which a Gaussian is visible, m.
-
-    Pixels are x, y with centres at +0.5; 0 outside the frame.
     """
     arrays = (posed.means, posed.covariances, posed.attributes.opacity, posed.normals)
-    means, covariances, opacities, normals = (x.detach().cpu().numpy() for x in arrays)
-    features = np.zeros((len(means), 1), np.float32)
-    raster = rasterize(means, covariances, opacities, features, camera, depth=True)
+    means, covariances, opacities, normals = (np.ascontiguousarray(x.detach().cpu().numpy()) for x in arrays)
+    raster = rasterize(means, covariances, opacities, normals, camera, depth=True)
     means, normals = means[:count], normals[:count]
     local = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -37,4 +49,6 @@ def in_sight(
     depth = raster.depth[row, column] / np.maximum(raster.alpha[row, column], 1e-6)
     towards = camera.position - means
     faces = (normals * towards).sum(1) > facing * np.linalg.norm(towards, axis=1)
-    return inside & faces & (local[:, 2] < depth + occlusion), pixels
+    surface = raster.image[row, column]
+    surface = surface / np.maximum(np.linalg.norm(surface, axis=1, keepdims=True), 1e-6)
+    return Sight(inside & faces & (local[:, 2] < depth + occlusion), pixels, surface)

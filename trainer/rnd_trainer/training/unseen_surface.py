@@ -45,7 +45,7 @@ def evidence(model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[
         camera = views[index].camera
         with torch.no_grad():
             posed = model(poses[index])
-        visible, _ = in_sight(posed, camera, count, facing=FACING, occlusion=OCCLUSION)
+        visible = in_sight(posed, camera, count, facing=FACING, occlusion=OCCLUSION).visible
         means, normals = posed.means.cpu().numpy(), posed.normals.cpu().numpy()
         towards = camera.position - means
         total += visible * (normals * towards).sum(1) / np.linalg.norm(towards, axis=1)

@@ -86,7 +86,7 @@ def card_gain(
     row, column = pixel
     nodes = model.config.nodes
     posed = model(pose)
-    visible, pixels = in_sight(posed, view.camera, nodes, facing=0.1, occlusion=0.03)
+    visible, pixels, _ = in_sight(posed, view.camera, nodes, facing=0.1, occlusion=0.03)
     if not visible.any():
         raise InputError(OPTION, expected="a visible body", got="none", frame=view.frame.frame)
     distance = np.where(visible, np.linalg.norm(pixels - [column + 0.5, row + 0.5], axis=1), np.inf)

@@ -39,7 +39,8 @@ class Observations:
     point: NDArray[np.int64]  # [n] index
     colour: Floats  # [n, 3] linear
     image: NDArray[np.int64]  # [n] index
-    posed: list[tuple[torch.Tensor, torch.Tensor]]  # means and normals of the points in each image
+    posed: list[tuple[torch.Tensor, torch.Tensor]]
+    """means and normals of the points in each image; of those observed, of the surface that the pixel shows"""
     spacing: float  # m
     light_of_image: Sequence[int] = ()  # index of each image's light; empty: all have one
 
@@ -71,15 +72,17 @@ def observe(
         view, camera = views[index], views[index].camera
         with torch.no_grad():
             posed = model(poses[index])
-        visible, pixel = in_sight(posed, camera, nodes, facing=FACING, occlusion=OCCLUSION)
-        column, row = pixel.astype(int).T
+        sight = in_sight(posed, camera, nodes, facing=FACING, occlusion=OCCLUSION)
+        column, row = sight.pixels.astype(int).T
         pixels = view.image[row, column]
         unclipped = (view.mask[row, column] == 255) & (pixels.max(1) < 250)
-        usable = np.nonzero(visible & unclipped)[0]
+        usable = np.nonzero(sight.visible & unclipped)[0]
         point.append(usable)
         colour.append(np.asarray(srgb_to_linear(pixels[usable] / 255), np.float64))
         image.append(np.full(len(usable), k))
-        posed_nodes.append((posed.means[:nodes].cpu(), posed.normals[:nodes].cpu()))
+        normals = posed.normals[:nodes].cpu().clone()
+        normals[usable] = torch.from_numpy(sight.normals[usable])
+        posed_nodes.append((posed.means[:nodes].cpu(), normals))
     points, colours, images = np.concatenate(point), np.concatenate(colour), np.concatenate(image)
     return Observations(points, colours, images, posed_nodes, spacing, of_light[chosen].tolist())
 
