@@ -195,7 +195,8 @@ def test_every_person_counts_once() -> None:
     rows = [
         _person_row("ours", 0, 0, 30.0, ssim=0.9),
         _person_row("ours", 0, 1, 32.0, ssim=0.94),
-        _person_row("ours", 1, 0, 21.0, ssim=0.8),
+        _person_row("ours", 1, 0, 20.0, ssim=0.8),
+        _person_row("ours", 1, 1, 22.0),
         _person_row("plain", 0, 0, 20.0),
         _person_row("plain", 1, 0, 22.0),
     ]

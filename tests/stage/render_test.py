@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import get_args
+
 import numpy as np
 import pytest
 
@@ -17,6 +20,7 @@ from rnd_runtime.shading.light import Light  # noqa: E402
 from rnd_runtime.shading.reference import shade_reference  # noqa: E402
 from rnd_stage import variants  # noqa: E402
 from rnd_stage.film import lights  # noqa: E402
+from rnd_stage.materials import Material  # noqa: E402
 from rnd_stage.render import RenderSet, Surface  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -110,3 +114,20 @@ def test_the_first_working_llvm_is_chosen(monkeypatch) -> None:
     monkeypatch.setattr(variants, "_candidates", lambda: iter(["old", "good", "other"]))
     monkeypatch.setattr(variants, "_renders", lambda library: library != "old")
     assert variants.working_llvm() == "good"
+
+
+def test_the_principled_material_reflects_the_same_colours_and_more_at_grazing_angles_where_it_is_rough() -> None:
+    light = np.ones((16, 32, 3))
+    camera = Camera.look_at([0.0, 0, 40], [0.0, 0, 0], width=48, height=48, fov_y=2 * np.arctan(1.0 / 40))
+    line = (np.arange(48) + 0.5) / 24 - 1
+    radius = np.hypot(*np.meshgrid(line, line))
+    ratios = {}
+    for roughness in (0.3, 0.9):
+        surface = replace(ball(), roughness=np.full(2 * 48**2, roughness))
+        both = [RenderSet(surface, material=m).radiance(camera, light, samples=64, seed=1) for m in get_args(Material)]
+        layered, principled = both
+        rim = (radius > 0.85) & (radius < 0.95)
+        ratios[roughness] = principled[rim].mean() / layered[rim].mean()
+        front = radius < 0.5
+        np.testing.assert_allclose(principled[front].mean(0), layered[front].mean(0), rtol=0.1)
+    assert ratios[0.9] > 1.02 > ratios[0.3]

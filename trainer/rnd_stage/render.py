@@ -1,8 +1,4 @@
-"""Path tracing a posed surface with Mitsuba 3, in this project's conventions.
-
-The material is that of ``rnd_runtime.shading.brdf``, formulated independently: Lambert plus GGX with F0 = 0.04, with
-exact Fresnel equations instead of Schlick's term. Mitsuba blends two materials, so both are divided by their share.
-"""
+"""Path tracing a posed surface with Mitsuba 3, in this project's conventions."""
 
 from __future__ import annotations
 
@@ -15,10 +11,11 @@ from numpy.typing import NDArray
 
 from rnd_runtime.core.camera import Camera
 
+from .materials import Material, material_of
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SPECULAR_SHARE = 0.3  # of the blend and of the sampled directions; any share gives the same mean
 MAX_SAMPLES = 2**24  # paths traced at once; LLVM needs about 200 B for each
 NEAR = 0.1  # m
 MASK_FLOOR = 0.05  # coverage below which ground truth is zero
@@ -61,11 +58,11 @@ class Truth:
 
 
 class RenderSet:
-    """A surface on the stage, for any camera and light; a ``max_depth`` of 2 is direct light alone."""
+    """A surface of a material, for any camera and light; a ``max_depth`` of 2 is direct light alone."""
 
-    def __init__(self, surface: Surface, *, max_depth: int = 5) -> None:
+    def __init__(self, surface: Surface, *, max_depth: int = 5, material: Material = "layered") -> None:
         self.surface, self.max_depth = surface, max_depth
-        self._mesh = mesh(surface, layered(), _layers(surface))
+        self._mesh = mesh(surface, *material_of(material, surface.colour, surface.roughness))
         self._scenes: dict[int, tuple[Floats, Any]] = {}
         self._plain: list[Any] = []
 
@@ -134,28 +131,6 @@ class RenderSet:
                 mi.load_dict({"type": "scene", "integrator": {"type": "aov", "aovs": aovs}, "figure": figure})
             )
         return scenes
-
-
-def layered() -> dict[str, Any]:
-    """The two-sided material with the attributes of ``_layers``."""
-
-    def attribute(name: str) -> dict[str, Any]:
-        return {"type": "mesh_attribute", "name": f"vertex_{name}"}
-
-    specular = {"type": "roughconductor", "distribution": "ggx", "alpha": attribute("alpha"), "eta": 1.5, "k": 0.0}
-    specular["specular_reflectance"] = attribute("gain")
-    diffuse = {"type": "diffuse", "reflectance": attribute("color")}
-    blend = {"type": "blendbsdf", "weight": SPECULAR_SHARE, "first": diffuse, "second": specular}
-    return {"type": "twosided", "sides": blend}
-
-
-def _layers(surface: Surface) -> dict[str, Floats]:
-    count = len(surface.vertices)
-    return {
-        "vertex_color": surface.colour / (1 - SPECULAR_SHARE),
-        "vertex_alpha": surface.roughness[:, None] ** 2,
-        "vertex_gain": np.full((count, 1), 1 / SPECULAR_SHARE),
-    }
 
 
 def mesh(surface: Surface, material: dict[str, Any], attributes: dict[str, Floats]) -> Any:

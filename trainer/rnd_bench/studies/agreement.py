@@ -26,6 +26,7 @@ from rnd_runtime.shading.sh import sh_basis, sphere_quadrature
 from rnd_runtime.shading.shader import SHADOW_RESOLUTION, Shader
 from rnd_runtime.shading.shadow import directional_visibility
 from rnd_stage.film.lights import stage_lights
+from rnd_stage.materials import Material
 from rnd_stage.render import RenderSet, Surface
 
 Floats = NDArray[np.float64]
@@ -120,9 +121,14 @@ def fitted_visibility(points: Floats, normals: Floats, radius: float) -> Floats:
 
 
 def compare(
-    name: str, surface: Surface, camera: Camera, samples: int, chosen: tuple[str, ...] = ()
+    name: str,
+    surface: Surface,
+    camera: Camera,
+    samples: int,
+    chosen: tuple[str, ...] = (),
+    material: Material = "layered",
 ) -> Iterator[Comparison]:
-    """One body under every light, or those ``chosen``, with ``samples`` of Mitsuba's paths per pixel.
+    """One body of ``material`` under every light, or those ``chosen``, with ``samples`` of Mitsuba's paths per pixel.
 
     In a row, ``psnr`` is of sRGB images against direct light, ``psnr_inside`` of the pixels well inside the
     silhouette, ``energy`` the ratio ours / Mitsuba's there; ``interreflection_*`` compares Mitsuba's direct light with
@@ -133,7 +139,7 @@ def compare(
     if unknown:
         raise InputError("--lights", expected=", ".join(lights), got=", ".join(unknown))
     gaussians = true_gaussians(surface)
-    direct, full = RenderSet(surface, max_depth=DIRECT), RenderSet(surface, max_depth=FULL)
+    direct, full = (RenderSet(surface, max_depth=depth, material=material) for depth in (DIRECT, FULL))
     coverage = full.truth(camera, samples=16, seed=0).coverage
     inside = binary_erosion(coverage > 0.99, iterations=RIM)
     if not inside.any():
@@ -148,6 +154,7 @@ def compare(
         row: dict[str, Any] = {
             "body": name,
             "light": light.name,
+            "material": material,
             "gaussians": len(gaussians.means),
             "size": camera.width,
             "samples": samples,

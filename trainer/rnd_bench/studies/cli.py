@@ -177,7 +177,7 @@ def run_agreement(options: Agreement) -> None:
         person = Wearer(dressed, motion, [options.frame]).surface(options.frame)
         for name, surface in (("ball", ball()), ("person", person)):
             progress.phase(f"{name}: fitting visibility, rendering")
-            for result in compare(name, surface, camera, options.samples, options.lights):
+            for result in compare(name, surface, camera, options.samples, options.lights, options.material):
                 row = {**result.row, "variant": variant, "machine": machine()}
                 ours = [f"{row[mode]['psnr_inside']:.1f} ({row[mode]['energy'] - 1:+.1%})" for mode in MODES]
                 more = (f"{row['noise_psnr']:.1f}", f"{row['interreflection_psnr']:.1f}")

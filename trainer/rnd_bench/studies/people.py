@@ -94,13 +94,12 @@ def run_study(
     """
     started = time.perf_counter()
     base = resized(preset("quick"), sizes.gaussians, sizes.steps)
-    total = (sizes.subjects - 1 + sizes.seeds) * len(variants)
+    total = sizes.subjects * sizes.seeds * len(variants)
     rows: list[dict[str, Any]] = []
     summaries: dict[str, list[dict[str, Any]]] = {}
     done = 0
     for subject in sizes.seeds_of_people:
         capture = load_capture(folder / f"subject{subject}")
-        seeds = tuple(range(sizes.seeds if subject == sizes.first else 1))
 
         def on_training(
             name: str, seed: int, of_subject: float, _: int, subject: int = subject, before: int = done
@@ -112,12 +111,12 @@ def run_study(
             base,
             folder / f"runs{subject}-{sizes.steps}-{sizes.gaussians}",
             variants,
-            seeds=seeds,
+            seeds=range(sizes.seeds),
             perceptual=perceptual,
             judge=judge,
             on_run=on_training,
         )
-        done += len(seeds) * len(variants)
+        done += sizes.seeds * len(variants)
         light = capture.split("train")[0].light
         rows += [{**row, "subject": subject, "train_light": light} for row in own]
         summaries[f"subject{subject}"] = summarise(own, variants)
@@ -138,8 +137,8 @@ def looks_before(file: Path) -> int:
 def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """A row for every method and split: FIGURES as means over the subjects, of each the mean over its seeds.
 
-    ``psnr_spread`` is the standard deviation over the first subject's seeds, ``psnr_subjects`` over the subjects; a
-    figure without rows is None.
+    ``psnr_spread`` is the standard deviation over a subject's seeds, in the mean, ``psnr_subjects`` that over the
+    subjects; a figure without rows is None.
     """
     table = []
     for method, split in dict.fromkeys((row["method"], row["split"]) for row in rows):
@@ -152,10 +151,10 @@ def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             each = [[row[figure] for row in of if row.get(figure) is not None] for of in by_subject.values()]
             each = [values for values in each if values]
             line[figure] = statistics.fmean(map(statistics.fmean, each)) if each else None
-        of_subjects = [statistics.fmean(row["psnr"] for row in of) for of in by_subject.values()]
-        line["psnr_subjects"] = statistics.stdev(of_subjects) if len(of_subjects) > 1 else None
-        first = [row["psnr"] for row in by_subject[min(by_subject)]]
-        line["psnr_spread"] = statistics.stdev(first) if len(first) > 1 else None
+        psnr = [[row["psnr"] for row in of] for of in by_subject.values()]
+        line["psnr_subjects"] = statistics.stdev(map(statistics.fmean, psnr)) if len(psnr) > 1 else None
+        spreads = [statistics.stdev(values) for values in psnr if len(values) > 1]
+        line["psnr_spread"] = statistics.fmean(spreads) if spreads else None
         table.append(line)
     return table
 

@@ -100,10 +100,10 @@ def film(
                 on_image(view.image(name))
     if not missing:
         return 0.0
-    started = time.process_time()
+    recipe, started = production.recipe, time.process_time()
     wearer = Wearer(production.dressed, production.motion, sorted({view.frame for view in missing}))
     for frame in sorted({view.frame for view in missing}):
-        stage = RenderSet(wearer.surface(frame), max_depth=production.recipe.max_depth)
+        stage = RenderSet(wearer.surface(frame), max_depth=recipe.max_depth, material=recipe.material)
         save_npz(folder / f"surface/{frame:06d}.npz", {"vertices": stage.surface.vertices.astype(np.float32)})
         for view in missing:
             if view.frame == frame:

@@ -12,6 +12,7 @@ import numpy as np
 from rnd_runtime.capture.format import TRAIN_SHARE, Frame, Split
 from rnd_runtime.cli.command import Count, Number, OptionalNumber, option
 from rnd_runtime.core.errors import check_option, flag, refuse_changed
+from rnd_stage.materials import Material
 
 from .lights import WHITE
 
@@ -43,6 +44,8 @@ class Recipe:
     """paths a pixel"""
     max_depth: Count = 5
     """of a path; 2 is direct light alone"""
+    material: Material = "layered"
+    """the player's own formula, or Mitsuba's principled material"""
     train_lights: Annotated[tuple[str, ...], option("NAME ...")] = (WHITE,)
     """names of the lights trained under; of several, instants take turns"""
     lights: Annotated[tuple[str, ...], option("NAME ...")] = ()
