@@ -22,12 +22,12 @@ from rnd_trainer.losses.perceptual import Perceptual
 
 from .options import PeopleSizes
 from .summary import summarise
-from .trainings import ablate
+from .trainings import ablate, compare_lights
 from .variants import StudyRow
 
 COST_FILE = "cost.json"
-FIGURES = ("psnr", "psnr_person", "ssim", "lpips", "psnr_n", "normal_deg", "psnr_albedo", "flicker")
-"""metrics of rnd-eval, averaged over the subjects"""
+FIGURES = ("psnr", "psnr_person", "ssim", "lpips", "psnr_n", "normal_deg", "psnr_albedo", "light_hue_de", "flicker")
+"""metrics of rnd-eval and ``light_hue_de``, averaged over the subjects"""
 
 
 def film_subjects(sizes: PeopleSizes, folder: Path, variant: str, on_image: Callable[[int, int], None]) -> None:
@@ -106,16 +106,18 @@ def run_study(
         ) -> None:
             on_run(f"subject {subject}, {name}, seed {seed}", before + of_subject, total)
 
+        runs = folder / f"runs{subject}-{sizes.steps}-{sizes.gaussians}"
         own = ablate(
             capture,
             base,
-            folder / f"runs{subject}-{sizes.steps}-{sizes.gaussians}",
+            runs,
             variants,
             seeds=range(sizes.seeds),
             perceptual=perceptual,
             judge=judge,
             on_run=on_training,
         )
+        own = compare_lights(own, runs, variants, capture)
         done += sizes.seeds * len(variants)
         light = capture.split("train")[0].light
         rows += [{**row, "subject": subject, "train_light": light} for row in own]

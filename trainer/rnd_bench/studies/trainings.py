@@ -28,6 +28,7 @@ from rnd_trainer.training.saving import resume_training
 from rnd_trainer.training.state import STATE_FILE, read_state
 from rnd_trainer.training.training import StepResult, Training
 
+from .light_hue import hue_difference
 from .variants import StudyRow
 
 ROWS = "rows.json"  # in the folder of a run
@@ -154,6 +155,24 @@ def time_encoders(
         for variant in variants
     }
     return [row | costs[row["method"]] for row in rows]
+
+
+def compare_lights(
+    rows: list[dict[str, Any]], folder: Path, variants: Sequence[StudyRow], capture: Capture
+) -> list[dict[str, Any]]:
+    """``rows`` with ``light_hue_de``, ``hue_difference`` of the learned light, where the true one is known."""
+    light = capture.split("train")[0].light
+    if light is None or not capture.has_map(light):
+        return rows
+    true = capture.load_light(light)
+    found = {}
+    for row in rows:
+        name, seed = row["method"], row["seed"]
+        if (name, seed) not in found:
+            variant = next(variant for variant in variants if variant.name == name)
+            checkpoint = load_checkpoint(_run_folder(folder, variant, seed) / "avatar.ckpt")
+            found[name, seed] = hue_difference(checkpoint.probe_of(light).double().numpy(), true)
+    return [row | {"light_hue_de": found[row["method"], row["seed"]]} for row in rows]
 
 
 @torch.no_grad()
