@@ -132,6 +132,8 @@ def _train(options: TrainOptions) -> None:
         if perceptual is None:
             without = "" if features is not None else ", and no consistency loss"
             log(f"no --perceptual-weights: multi-scale DSSIM instead of LPIPS{without}")
+        if config.light == "learn" and config.skin is None and known.place is None and known.card is None:
+            log("no --skin 1 to 6 (Fitzpatrick): how bright the person is against the light is assumed")
         for frame in training.bad_masks:
             warn(f"frame {frame}: mask empty or full, skipped")
         log(f"{folder}: {training.schedule.total} steps; rnd-view {shlex.quote(str(folder))} shows them")
