@@ -89,7 +89,7 @@ def initial_light(
     poses: Sequence[PoseInput],
     lights: Sequence[int] = (),
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-    skin: NDArray[np.int64] | None = None,
+    skin: Sequence[NDArray[np.int64]] = (),
     tone: float | None = None,
 ) -> InitialLight | None:
     """The lights that best explain the images; None if the body is hardly visible, or only from one side.
@@ -101,7 +101,7 @@ def initial_light(
         model: after the first stage.
         views, poses: of the training images.
         lights: index of the light of each image; empty: all have one.
-        skin: indices of points that may be skin; None: none.
+        skin: indices of points that may be skin, by place.
         tone: known reflectance of the skin.
         on_progress: called with done and total.
     """
@@ -150,7 +150,7 @@ def initial_light(
     radiance[light, near_texels[texel]] += intensity[skies:]
     irradiance = columns[:, [*range(skies), *suns]] @ intensity
     albedo, weight = albedo_under(observations, irradiance)
-    radiance /= likely_gain(albedo, weight * (weight >= MIN_OBSERVATIONS), [] if skin is None else skin, tone)
+    radiance /= likely_gain(albedo, weight * (weight >= MIN_OBSERVATIONS), skin, tone)
     return InitialLight(
         radiance.reshape(-1, *PROBE_SHAPE, 3).astype(np.float32), exposure.reshape(-1, *PROBE_SHAPE).astype(np.float32)
     )

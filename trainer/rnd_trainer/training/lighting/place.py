@@ -44,7 +44,7 @@ def placed_light(
     poses: Sequence[PoseInput],
     place: Light,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-    skin: NDArray[np.int64] | None = None,
+    skin: Sequence[NDArray[np.int64]] = (),
     tone: float | None = None,
 ) -> NDArray[np.float32] | None:
     """Radiance [32, 64, 3] of ``place``, turned and scaled to the images; None if the body is hardly visible.
@@ -68,7 +68,7 @@ def placed_light(
         for values in (_at_all_yaws(place, PROBE_SHAPE), irradiance)
     )
     albedo, count = albedo_under(observations, arriving)
-    gain = likely_gain(albedo, count * (count >= MIN_OBSERVATIONS), [] if skin is None else skin, tone)
+    gain = likely_gain(albedo, count * (count >= MIN_OBSERVATIONS), skin, tone)
     on_progress(2, 2)
     return (radiance / (gain @ REC709_LUMINANCE)).astype(np.float32)
 
