@@ -17,7 +17,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton, taken_along
-from rnd_runtime.posing.levels import NODES_SHARE, Surface, coarser, on_fewer_nodes
+from rnd_runtime.posing.levels import NODES_SHARES, Surface, coarser, on_fewer_nodes
 from rnd_runtime.posing.rest import RestPose, Unposed
 from rnd_runtime.posing.window import moment
 from rnd_runtime.shading.brdf import LARGEST_ALBEDO
@@ -25,7 +25,7 @@ from rnd_runtime.shading.brdf import LARGEST_ALBEDO
 from .file import REST_OUTPUTS
 from .networks import Networks
 
-MIN_GAUSSIANS = 2000
+MIN_GAUSSIANS = 2100
 """of a level that has a coarser one"""
 
 
@@ -98,22 +98,28 @@ class Avatar:
     def level(self, number: int) -> Avatar | None:
         """At a level of detail: 0 is itself, others are for fewer and fewer pixels; None beyond the coarsest.
 
-        The first has all Gaussians and a share of the nodes, where the file allows that; others have no more nodes.
-        They are made on first use, each in a twentieth of a second, and kept.
+        The first have all Gaussians and a share of the nodes, where the file allows that; others have no more nodes.
+        They are made on first use, each in a hundredth of a second, and kept.
         """
+        by_nodes = NODES_SHARES if self._levels[0]._networks.can_leave_out_nodes else ()
         while len(self._levels) <= number:
-            coarser = self._levels[-1]._next_level()
-            if coarser is None:
+            whole, coarsest, made = self._levels[0], self._levels[-1], len(self._levels) - 1
+            level = whole._on_nodes(by_nodes[made]) if made < len(by_nodes) else coarsest._merged()
+            if level is None:
                 return None
-            self._levels.append(coarser)
+            self._levels.append(level)
         return self._levels[number]
 
-    def _next_level(self) -> Avatar | None:
-        if self._rest is not None and self._networks.can_leave_out_nodes:
-            kept = np.arange(0, self.nodes, NODES_SHARE)
-            level = shallow_copy(self, nodes=len(kept))
-            level._networks, level._rest = self._networks.at_nodes(kept.tolist()), on_fewer_nodes(self._rest, kept)
-            return level
+    def _on_nodes(self, share: int) -> Avatar:
+        """On every ``share``-th node."""
+        assert self._rest is not None
+        kept = np.arange(0, self.nodes, share)
+        level = shallow_copy(self, nodes=len(kept))
+        level._networks, level._rest = self._networks.at_nodes(kept.tolist()), on_fewer_nodes(self._rest, kept)
+        return level
+
+    def _merged(self) -> Avatar | None:
+        """With fewer Gaussians; None where it is the coarsest."""
         if self._rest is None or self.gaussians <= MIN_GAUSSIANS:
             return None
         surface = coarser(Surface(self._rest, self._opacities, self._albedo, self._roughness))

@@ -37,7 +37,7 @@ from .frame import FrameRenderer, RenderedFrame, features_of, in_root_frame, spl
 from .framing import CameraPath, Framing, frame_motion
 
 _PART_OF_A_FRAME = 1e-4  # tolerance of rounded times
-LEVEL_SPACING, NODE_SPACING = 0.35, 24.0
+LEVEL_SPACING, NODE_SPACING = 1.1, 24.0
 """px, spacings of the Gaussians and of the nodes up to which a coarser level is taken: neighbouring levels then differ
 by 1/255 at most, as root mean square over the body's box (``rnd-bench scenes``)"""
 HYSTERESIS = 1.15

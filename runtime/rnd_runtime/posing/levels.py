@@ -8,7 +8,7 @@ keeps the coverage of the body.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -19,10 +19,10 @@ from .rest import RestPose
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
-KEPT = 0.9
+KEPT = 0.97
 """share of the Gaussians that the next coarser level keeps"""
-NODES_SHARE = 4
-"""nodes for each one that coarser levels keep: 0.6/255 of difference at any size"""
+NODES_SHARES = (4, 16)
+"""nodes for each one that the first levels keep: 0.6 and 0.9/255 of difference at any size"""
 WINDOW = 96  # Gaussians along a space-filling curve among which a partner is searched
 MIN_COSINE = 0.6  # of the normals of a pair
 REACH = 2.5  # median distances to the nearest neighbour on the same side that a pair may be apart
@@ -65,41 +65,57 @@ class Surface(NamedTuple):
 
 
 def coarser(surface: Surface) -> Surface:
-    """``surface`` with ``KEPT`` of its Gaussians, or more where too few are alike."""
+    """``surface`` with ``KEPT`` of its Gaussians, or more where too few are alike; the others stay as they are."""
     rest, opacities, albedo, roughness = surface
-    points, normals = rest.points.astype(np.float64), rest.normals.astype(np.float64)
-    a, b = _pairs(points, normals, albedo.astype(np.float64))
-    alone = a == b
-    factors = rest.factors.reshape(-1, 3, 3).astype(np.float64)
-    covariances = factors @ factors.transpose(0, 2, 1)
-    areas = _areas(np.asarray(np.linalg.eigvalsh(covariances), np.float64))
-    weights = np.maximum(areas * opacities, 1e-30)
-    share = np.where(alone, 1.0, weights[a] / (weights[a] + weights[b]))
+    a, b = _pairs(rest.points.astype(np.float64), rest.normals.astype(np.float64), albedo.astype(np.float64))
+    first, second = (_covariances(rest.factors[each]) for each in (a, b))
+    areas = _areas(_variances(first)), _areas(_variances(second))
+    weights = [np.maximum(area * opacities[each], 1e-30) for area, each in zip(areas, (a, b))]
+    share = weights[0] / (weights[0] + weights[1])
 
-    def mean(values: NDArray[np.floating]) -> Floats:
-        ours = share.reshape(-1, *[1] * (values.ndim - 1))
-        return np.asarray(ours * values[a] + (1 - ours) * values[b], np.float64)
+    def mean(one: NDArray[np.floating], other: NDArray[np.floating]) -> Floats:
+        ours = share.reshape(-1, *[1] * (one.ndim - 1))
+        return np.asarray(ours * one + (1 - ours) * other, np.float64)
 
-    apart = points[b] - points[a]
+    apart = (rest.points[b] - rest.points[a]).astype(np.float64)
     spread = (share * (1 - share))[:, None, None] * apart[:, :, None] * apart[:, None, :]
-    variances, axes = np.linalg.eigh(mean(covariances) + spread)
-    covered = areas[a] + np.where(alone, 0, areas[b])
-    growth = np.maximum(covered / np.maximum(_areas(variances), 1e-30), 1) ** GROWTH
+    variances, axes = np.linalg.eigh(mean(first, second) + spread)
+    growth = np.maximum((areas[0] + areas[1]) / np.maximum(_areas(variances), 1e-30), 1) ** GROWTH
     variances = np.maximum(variances, 0) * np.stack([np.ones_like(growth), growth, growth], axis=1)
-    normal = mean(normals)
+    normal = mean(rest.normals[a], rest.normals[b])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    kept = np.where(share >= 0.5, a, b)
-    merged = replace(
+    kept = np.delete(np.arange(len(opacities)), b)
+    merged, heavier = np.searchsorted(kept, a), np.where(share >= 0.5, a, b)
+
+    def with_merged(values: NDArray[Any], of_pairs: NDArray[Any] | None = None) -> NDArray[Any]:
+        """``values`` of those left, and of pairs: ``of_pairs``, by default the heavier one's."""
+        left = values[kept]
+        left[merged] = values[heavier] if of_pairs is None else of_pairs
+        return left
+
+    factors = (axes * np.sqrt(variances)[:, None, :]).reshape(-1, 9)
+    fewer = replace(
         rest,
-        neighbours=rest.neighbours[kept],
-        neighbour_weights=rest.neighbour_weights[kept],
-        log_template=rest.log_template[kept],
-        points=mean(points).astype(np.float32),
-        factors=(axes * np.sqrt(variances)[:, None, :]).reshape(-1, 9).astype(np.float32),
-        normals=normal.astype(np.float32),
-        limbs=rest.limbs[kept],
+        neighbours=with_merged(rest.neighbours),
+        neighbour_weights=with_merged(rest.neighbour_weights),
+        log_template=with_merged(rest.log_template),
+        points=with_merged(rest.points, mean(rest.points[a], rest.points[b])),
+        factors=with_merged(rest.factors, factors),
+        normals=with_merged(rest.normals, normal),
+        limbs=with_merged(rest.limbs),
     )
-    return Surface(merged, *(mean(each).astype(np.float32) for each in (opacities, albedo, roughness)))
+    return Surface(fewer, *(with_merged(each, mean(each[a], each[b])) for each in (opacities, albedo, roughness)))
+
+
+def _covariances(factors: Floats32) -> Floats:
+    """[P, 3, 3] of factors [P, 9]."""
+    square = factors.reshape(-1, 3, 3).astype(np.float64)
+    return np.asarray(square @ square.transpose(0, 2, 1), np.float64)
+
+
+def _variances(covariances: Floats) -> Floats:
+    """Ascending [P, 3] along the axes of [P, 3, 3]."""
+    return np.asarray(np.linalg.eigvalsh(covariances), np.float64)
 
 
 def _areas(variances: Floats) -> Floats:
@@ -108,17 +124,14 @@ def _areas(variances: Floats) -> Floats:
 
 
 def _pairs(points: Floats, normals: Floats, albedo: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows (a, b) of each merged Gaussian, along a Z-curve; a = b where it stays as it is."""
+    """Rows (a, b) of each pair that is merged."""
     order = _z_curve(points)
     count = len(order)
     partner, cost = np.full(count, -1, np.int64), np.full(count, np.inf)
     _match(points[order], normals[order], albedo[order], partner, cost)
     first = np.flatnonzero(partner > np.arange(count))
     cheapest = first[np.argsort(cost[first], kind="stable")[: round((1 - KEPT) * count)]]
-    second = np.arange(count)
-    second[cheapest] = partner[cheapest]
-    rows = np.setdiff1d(np.arange(count), partner[cheapest])
-    return order[rows], order[second[rows]]
+    return order[cheapest], order[partner[cheapest]]
 
 
 def _z_curve(points: Floats) -> NDArray[np.int64]:

@@ -155,9 +155,10 @@ def test_levels_follow_the_size_with_hysteresis():
 def test_levels_have_fewer_and_fewer_nodes_and_gaussians(avatar):
     sizes = greatest_sizes(avatar)
     levels = [avatar.level(number) for number in range(len(sizes))]
-    assert avatar.level(len(sizes)) is None and levels[1].gaussians == avatar.gaussians
-    assert (np.diff([level.gaussians for level in levels[1:]]) < 0).all()
-    assert {level.nodes for level in levels[1:]} == {-(-avatar.nodes // 4)}
+    assert avatar.level(len(sizes)) is None
+    nodes = [level.nodes for level in levels]
+    assert nodes == [avatar.nodes, -(-avatar.nodes // 4), *[-(-avatar.nodes // 16)] * (len(levels) - 2)]
+    assert levels[2].gaussians == avatar.gaussians and (np.diff([level.gaussians for level in levels[2:]]) < 0).all()
     assert sizes[0] == np.inf and (np.diff(sizes) < 0).all()
 
 
@@ -166,7 +167,7 @@ def test_far_people_get_coarser_levels_and_parts_of_a_run_the_same(avatar, motio
     people = [Person(avatar, motion), Person(avatar, motion, 0, place_at(0.5, -40, 0))]
 
     def camera_at(frame: int, time: float) -> Camera:
-        return Camera.look_at([0, 1, 6 + 12 * frame], [0, 1, 0], width=90, height=90, fov_y=0.8)
+        return Camera.look_at([0, 1, 6 + 12 * frame], [0, 1, 0], width=400, height=400, fov_y=0.8)
 
     with FrameRenderer(avatar, Light(np.ones((16, 32, 3), np.float32)), shade="ao") as renderer:
         scene = SceneRenderer(people, renderer)
