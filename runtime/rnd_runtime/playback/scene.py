@@ -198,7 +198,8 @@ class SceneRenderer:
         joints = [body.avatar.joints(body) for body in moved]
         seconds["posing"], started = perf_counter() - started, perf_counter()
         shader, view = in_root_frame(frame, self.renderer.shader, camera)
-        visible, features = self._shaded(shown, joints, shader, view, aovs, given)
+        details = [person.avatar.spacing / body.avatar.spacing for person, body in zip(self.people, bodies)]
+        visible, features = self._shaded(shown, joints, shader, view, aovs, given, details)
         seconds["shading"] = perf_counter() - started
         raster = self._splatted(shown, joints, visible, features, view, "depth" in aovs)
         for stage, spent in raster.seconds.items():
@@ -225,13 +226,14 @@ class SceneRenderer:
         camera: Camera,
         aovs: Sequence[str],
         given: Sequence[Mapping[str, Floats32]],
+        details: Sequence[float],
     ) -> tuple[list[NDArray[np.bool_]], list[Floats32]]:
-        """Who is visible [N] and features [N, C], for each body."""
+        """Who is visible [N] and features [N, C], for each body; ``details`` are as of ``_sunlit``."""
         visible = [
             visible_to(gaussians, camera, None if cull is None or cull <= -1 else cull)
             for gaussians, cull in zip(posed, self._culls)
         ]
-        sunlit = self._sunlit(posed, joints, shader, visible)
+        sunlit = self._sunlit(posed, joints, shader, visible, details)
         features = [
             features_of(gaussians, shader, camera, seen, aovs=aovs, lit=True, given=own, sunlit=reached)
             for gaussians, seen, own, reached in zip(posed, visible, given, sunlit)
@@ -244,8 +246,12 @@ class SceneRenderer:
         joints: Sequence[NDArray[np.float64]],
         shader: Shader,
         receivers: Sequence[NDArray[np.bool_]],
+        details: Sequence[float],
     ) -> list[Floats32]:
-        """``Shader.sunlit`` of each body past all of them; those whose shadows may meet share a map."""
+        """``Shader.sunlit`` of each body past all of them; those whose shadows may meet share a map.
+
+        The maps of coarser levels are coarser too: ``details`` are the whole avatars' spacings over those shown.
+        """
         directions = shader.directional_arrays().directions
         sunlit = [np.zeros((len(gaussians.means), len(directions)), np.float32) for gaussians in posed]
         low, high = (np.array([side(points, axis=0) for points in joints]) for side in (np.min, np.max))
@@ -265,7 +271,8 @@ class SceneRenderer:
                     )
                 )
                 wider = 1 + np.ptp(across[bodies], axis=0).max() / sizes[bodies].max()
-                resolution = min(round(SHADOW_RESOLUTION * wider), MAX_SHADOW_RESOLUTION)
+                detail = max(details[i] for i in bodies)
+                resolution = min(round(SHADOW_RESOLUTION * wider * detail), MAX_SHADOW_RESOLUTION)
                 reached = directional_visibility(
                     points, normals, direction[None], radii=radii, resolution=resolution, receivers=seen
                 )
