@@ -88,6 +88,24 @@ def test_a_first_sun_must_explain_more_than_errors_do(monkeypatch) -> None:
     assert peaks[0] > 30 and peaks[1] < 4
 
 
+def test_a_window_is_found_as_broad_as_it_is(monkeypatch) -> None:
+    """On a ball, which has no shadows to tell by, the lesser error decides."""
+    monkeypatch.setattr(light_search, "BROADER", 1.0)
+    towards = np.array([0.7, 0.3, 0.65]) / np.linalg.norm([0.7, 0.3, 0.65])
+    directions, solid_angles = texel_directions(32, 64).reshape(-1, 3), texel_solid_angles(32, 64).reshape(-1)
+    true = 1 + 60 * np.exp(light_search.WINDOW_SHARPNESS * (directions @ towards - 1))
+    ball = rotating_ball(towards, 0.0)
+    normals = np.concatenate([n[ball.point[ball.image == k]] for k, (_, n) in enumerate(ball.posed)])
+    share = np.maximum(normals @ directions.T, 0) * solid_angles / math.pi
+    ball.colour *= (share @ true)[:, None]
+    monkeypatch.setattr(light_search, "observe", lambda *_: ball)
+    found = initial_light(None, [], [])  # type: ignore[arg-type]
+    assert found is not None
+    grey = found.radiance[0].mean(-1).reshape(-1)
+    assert directions[grey.argmax()] @ towards > math.cos(math.radians(12))  # a texel of the coarse search
+    assert 0.5 < grey.max() / np.median(grey) / (true.max() / np.median(true)) < 2  # a sun's is 20 times as much
+
+
 def test_no_sun_is_below_the_floor(monkeypatch) -> None:
     """Light from below is the ground's: broad."""
     sun = np.array([0.5, -0.7, 0.51])

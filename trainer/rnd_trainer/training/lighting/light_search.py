@@ -4,10 +4,10 @@ The images are
 
     I_pf = albedo_p Σ_k L_k V_pfk max(n_pf · ω_k, 0) Δω_k / π        (paper, eq. 3, without the specular lobe)
 
-Whatever the albedo of a point is, its colours over the images are parallel to its irradiance. A dictionary of broad
-lobes (sky) and single directions with traced shadows is fitted by non-negative least squares; directions are added by
-orthogonal matching pursuit (Pati et al. 1993). Intensities minimise the absolute error of log colours by iteratively
-reweighted least squares (Holland & Welsch 1977).
+Whatever the albedo of a point is, its colours over the images are parallel to its irradiance. A dictionary of sky
+lobes, single directions (suns) and lobes between them (windows, a glowing horizon), all with traced shadows, is fitted
+by non-negative least squares; all but the sky are added by orthogonal matching pursuit (Pati et al. 1993). Intensities
+minimise the absolute error of log colours by iteratively reweighted least squares (Holland & Welsch 1977).
 """
 
 from __future__ import annotations
@@ -48,8 +48,13 @@ SKY_SHARPNESS = 4.0
 """λ of exp(λ(cos − 1)): lobes 24° wide"""
 SKY_FLOOR = 0.02
 """smallest radiance relative to the mean: the probe stores logarithms"""
+WINDOW_SHARPNESS = 16.0
+"""λ of windows: 14° wide"""
+BROADER = 1.5
+"""decrease of the error by a window, relative to that by a sun, from which on it is one: 2.0 and 3.0 where the light of
+development captures is broad, up to 1.25 where it is sharp"""
 MAX_LIGHTS = 3
-"""directional lights of each light of the capture"""
+"""suns and windows of each light of the capture"""
 FIRST_GAIN = 5e-3
 """decrease of the squared error by the first directional light, relative to the geometric mean of error and energy,
 below which there is none; of several lights their share. The weakest true ones of development captures have 6.3e-3; in
@@ -127,28 +132,37 @@ def initial_light(
     coarse = with_bounce(coarse, hidden)
     blocks, skies = observations.blocks, SKY_LOBES * observations.lights
     sky = blocks(coarse @ _lobes(coarse_directions).astype(np.float32))
-    quadratic = _quadratic(observations, np.concatenate([sky, blocks(coarse)], axis=1), weight)
+    of_windows = coarse @ _windows(coarse_directions, coarse_directions).astype(np.float32)
+    others = blocks(np.concatenate([coarse, of_windows], axis=1))
+    quadratic = _quadratic(observations, np.concatenate([sky, others], axis=1), weight)
     advance()
     if quadratic.is_undetermined():
         return None
-    above = np.tile(coarse_directions[:, 1] > 0, observations.lights)
-    coarse_suns = (np.array(_search(quadratic, above), int) - skies) % len(coarse_directions)
+    above = np.tile(coarse_directions[:, 1] > 0, 2 * observations.lights)
+    window = np.tile(np.arange(2 * len(coarse_directions)) >= len(coarse_directions), observations.lights)
+    found = (np.array(_search(quadratic, above, window), int) - skies) % (2 * len(coarse_directions))
     advance()
-    near_texels = _texels_near(directions, coarse_directions[coarse_suns])
-    fine = blocks(with_bounce(transport_of(observations, directions[near_texels], solid_angles[near_texels]), hidden))
-    columns = np.concatenate([sky, fine], axis=1)
-    above = np.tile(directions[near_texels, 1] > 0, observations.lights)
-    suns = _search(_quadratic(observations, columns, weight), above)
+    windows = np.unique(found[found >= len(coarse_directions)]) - len(coarse_directions)
+    near_texels = _texels_near(directions, coarse_directions[found[found < len(coarse_directions)]])
+    fine = with_bounce(transport_of(observations, directions[near_texels], solid_angles[near_texels]), hidden)
+    columns = np.concatenate([sky, blocks(np.concatenate([fine, of_windows[:, windows]], axis=1))], axis=1)
+    maps = np.zeros((len(near_texels) + len(windows), len(directions)))  # radiance of each column after the sky's
+    maps[np.arange(len(near_texels)), near_texels] = 1
+    maps[len(near_texels) :] = _windows(directions, coarse_directions[windows]).T
+    window = np.tile(np.arange(len(maps)) >= len(near_texels), observations.lights)
+    above = np.tile(np.append(directions[near_texels, 1] > 0, np.ones(len(windows), bool)), observations.lights)
+    chosen = _search(_quadratic(observations, columns, weight), above, window)
     advance()
-    intensity = _intensities(observations, columns[:, [*range(skies), *suns]])
+    intensity = _intensities(observations, columns[:, [*range(skies), *chosen]])
     advance()
     radiance = np.stack([_lobes(directions) @ block for block in np.split(intensity[:skies], observations.lights)])
     radiance = np.maximum(radiance, SKY_FLOOR * radiance.mean((1, 2), keepdims=True))
     observed = np.unique(observations.light())
     radiance[np.setdiff1d(np.arange(len(radiance)), observed)] = radiance[observed].mean(0)
-    light, texel = np.divmod(np.array(suns, int) - skies, max(len(near_texels), 1))
-    radiance[light, near_texels[texel]] += intensity[skies:]
-    irradiance = columns[:, [*range(skies), *suns]] @ intensity
+    for column, of_column in zip(chosen, intensity[skies:]):
+        light, shape = divmod(column - skies, len(maps))
+        radiance[light] += maps[shape, :, None] * of_column
+    irradiance = columns[:, [*range(skies), *chosen]] @ intensity
     albedo, weight = albedo_under(observations, irradiance)
     radiance /= likely_gain(albedo, weight * (weight >= MIN_OBSERVATIONS), skin, tone)
     return InitialLight(
@@ -159,7 +173,7 @@ def initial_light(
 def warm_up() -> None:
     """Fit a sky to random data: linear algebra allocates its buffers."""
     rng = np.random.default_rng(0)
-    transport = rng.random((8 * MAX_NODES, SKY_LOBES + math.prod(SEARCH_SHAPE)), dtype=np.float32)
+    transport = rng.random((8 * MAX_NODES, SKY_LOBES + 2 * math.prod(SEARCH_SHAPE)), dtype=np.float32)
     colour, point = 0.1 + rng.random((len(transport), 3)), np.arange(len(transport)) % MAX_NODES
     observations = Observations(point, colour, np.zeros(len(point), np.int64), [], 0.0)
     _quadratic(observations, transport, point_luminance(observations)).fit(range(SKY_LOBES))
@@ -261,8 +275,11 @@ def _intensities(observations: Observations, columns: NDArray[np.float32]) -> Fl
     return intensity
 
 
-def _search(quadratic: Quadratic, above: NDArray[np.bool_]) -> list[int]:
-    """Columns of the directional lights, in the order in which they are added; only those ``above`` the horizon.
+def _search(quadratic: Quadratic, above: NDArray[np.bool_], window: NDArray[np.bool_]) -> list[int]:
+    """Columns of suns and windows, in the order in which they are added; only those ``above`` the horizon.
+
+    ``above`` and ``window`` are of the columns after the sky's. Errors blur, so a window must explain much more than a
+    sun does, and as much as a first one must.
 
     Without shadows a direction and its opposite have similar gradients: above degree 1 the SH coefficients of a cosine
     lobe are even only (Ramamoorthi & Hanrahan 2001). ``CANDIDATES`` are therefore fitted.
@@ -277,14 +294,23 @@ def _search(quadratic: Quadratic, above: NDArray[np.bool_]) -> list[int]:
         gain = quadratic.gains(columns, intensity)
         gain[columns] = -np.inf
         gain[skies:][~above] = -np.inf
-        tried = [k for k in np.argsort(-gain)[:CANDIDATES].tolist() if gain[k] > -np.inf]
-        after, best = min(((quadratic.fit([*columns, k])[0], k) for k in tried), default=(before, -1))
-        least = MIN_GAIN * before if len(columns) > skies else FIRST_GAIN * math.sqrt(before * energy)
-        if before - after < least / lights:
+        after, best = _best(quadratic, columns, np.where(np.append(np.zeros(skies, bool), window), -np.inf, gain))
+        broad, widest = _best(quadratic, columns, np.where(np.append(np.zeros(skies, bool), ~window), -np.inf, gain))
+        first = FIRST_GAIN * math.sqrt(before * energy) / lights
+        least = MIN_GAIN * before / lights if len(columns) > skies else first
+        if before - broad > max(BROADER * (before - after), first):
+            after, best = broad, widest
+        if before - after < least:
             break
         columns.append(best)
         before, intensity = quadratic.fit(columns)
     return columns[skies:]
+
+
+def _best(quadratic: Quadratic, columns: list[int], gain: Floats) -> tuple[float, int]:
+    """Least error with one column more, of the ``CANDIDATES`` of greatest ``gain`` [Q], and that column."""
+    tried = [k for k in np.argsort(-gain)[:CANDIDATES].tolist() if gain[k] > -np.inf]
+    return min(((quadratic.fit([*columns, k])[0], k) for k in tried), default=(math.inf, -1))
 
 
 def _grid(shape: tuple[int, int]) -> tuple[Floats, Floats]:
@@ -315,6 +341,11 @@ def _lobe_centres() -> Floats:
 def _lobes(directions: Floats) -> Floats:
     """Sky lobes [K, SKY_LOBES] at ``directions`` [K, 3]."""
     return np.exp(SKY_SHARPNESS * (directions @ _lobe_centres().T - 1))
+
+
+def _windows(directions: Floats, centres: Floats) -> Floats:
+    """Windows [K, C] around ``centres`` [C, 3] at ``directions`` [K, 3]."""
+    return np.exp(WINDOW_SHARPNESS * (directions @ centres.T - 1))
 
 
 def _texels_near(directions: Floats, centres: Floats) -> NDArray[np.int64]:

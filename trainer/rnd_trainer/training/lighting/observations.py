@@ -25,9 +25,7 @@ Floats = NDArray[np.float64]
 FRAMES = 40
 """images observed, evenly spaced"""
 FACING = 0.3
-"""smallest cosine between the normal of an observed point and the view"""
-SURFACE_FACING = 0.6
-"""the same of the surface that its pixel shows: at grazing angles it is seen mixed, and mirrors what is behind it"""
+"""smallest cosine between normal and view of an observation; light from behind is seen on rims alone"""
 OCCLUSION = 0.03
 """distance behind the first surface up to which a point is visible, m"""
 MIN_OBSERVATIONS = 3
@@ -78,16 +76,13 @@ def observe(
         column, row = sight.pixels.astype(int).T
         pixels = view.image[row, column]
         unclipped = (view.mask[row, column] == 255) & (pixels.max(1) < 250)
-        means = posed.means[:nodes].cpu()
-        towards = torch.nn.functional.normalize(torch.as_tensor(camera.position).to(means) - means, dim=1).numpy()
-        frontal = (sight.normals * towards).sum(1) > SURFACE_FACING
-        usable = np.nonzero(sight.visible & frontal & unclipped)[0]
+        usable = np.nonzero(sight.visible & unclipped)[0]
         point.append(usable)
         colour.append(np.asarray(srgb_to_linear(pixels[usable] / 255), np.float64))
         image.append(np.full(len(usable), k))
         normals = posed.normals[:nodes].cpu().clone()
         normals[usable] = torch.from_numpy(sight.normals[usable])
-        posed_nodes.append((means, normals))
+        posed_nodes.append((posed.means[:nodes].cpu(), normals))
     points, colours, images = np.concatenate(point), np.concatenate(colour), np.concatenate(image)
     return Observations(points, colours, images, posed_nodes, spacing, of_light[chosen].tolist())
 
