@@ -131,16 +131,15 @@ def initial_light(
     hidden = np.maximum(1 - coarse.sum(1), 0)
     coarse = with_bounce(coarse, hidden)
     blocks, skies = observations.blocks, SKY_LOBES * observations.lights
-    sky = blocks(coarse @ _lobes(coarse_directions).astype(np.float32))
-    of_windows = coarse @ _windows(coarse_directions, coarse_directions).astype(np.float32)
+    sky = blocks(coarse @ _sky(coarse_directions).astype(np.float32))
+    of_windows = coarse @ _lobes(coarse_directions, coarse_directions, WINDOW_SHARPNESS).astype(np.float32)
     others = blocks(np.concatenate([coarse, of_windows], axis=1))
     quadratic = _quadratic(observations, np.concatenate([sky, others], axis=1), weight)
     advance()
     if quadratic.is_undetermined():
         return None
-    above = np.tile(coarse_directions[:, 1] > 0, 2 * observations.lights)
-    window = np.tile(np.arange(2 * len(coarse_directions)) >= len(coarse_directions), observations.lights)
-    found = (np.array(_search(quadratic, above, window), int) - skies) % (2 * len(coarse_directions))
+    above = coarse_directions[:, 1] > 0
+    found = (np.array(_search(quadratic, above, above), int) - skies) % (2 * len(coarse_directions))
     advance()
     windows = np.unique(found[found >= len(coarse_directions)]) - len(coarse_directions)
     near_texels = _texels_near(directions, coarse_directions[found[found < len(coarse_directions)]])
@@ -148,14 +147,12 @@ def initial_light(
     columns = np.concatenate([sky, blocks(np.concatenate([fine, of_windows[:, windows]], axis=1))], axis=1)
     maps = np.zeros((len(near_texels) + len(windows), len(directions)))  # radiance of each column after the sky's
     maps[np.arange(len(near_texels)), near_texels] = 1
-    maps[len(near_texels) :] = _windows(directions, coarse_directions[windows]).T
-    window = np.tile(np.arange(len(maps)) >= len(near_texels), observations.lights)
-    above = np.tile(np.append(directions[near_texels, 1] > 0, np.ones(len(windows), bool)), observations.lights)
-    chosen = _search(_quadratic(observations, columns, weight), above, window)
+    maps[len(near_texels) :] = _lobes(directions, coarse_directions[windows], WINDOW_SHARPNESS).T
+    chosen = _search(_quadratic(observations, columns, weight), directions[near_texels, 1] > 0, above[windows])
     advance()
     intensity = _intensities(observations, columns[:, [*range(skies), *chosen]])
     advance()
-    radiance = np.stack([_lobes(directions) @ block for block in np.split(intensity[:skies], observations.lights)])
+    radiance = np.stack([_sky(directions) @ block for block in np.split(intensity[:skies], observations.lights)])
     radiance = np.maximum(radiance, SKY_FLOOR * radiance.mean((1, 2), keepdims=True))
     observed = np.unique(observations.light())
     radiance[np.setdiff1d(np.arange(len(radiance)), observed)] = radiance[observed].mean(0)
@@ -275,16 +272,19 @@ def _intensities(observations: Observations, columns: NDArray[np.float32]) -> Fl
     return intensity
 
 
-def _search(quadratic: Quadratic, above: NDArray[np.bool_], window: NDArray[np.bool_]) -> list[int]:
-    """Columns of suns and windows, in the order in which they are added; only those ``above`` the horizon.
+def _search(quadratic: Quadratic, suns: NDArray[np.bool_], windows: NDArray[np.bool_]) -> list[int]:
+    """Columns of suns and windows, in the order in which they are added.
 
-    ``above`` and ``window`` are of the columns after the sky's. Errors blur, so a window must explain much more than a
-    sun does, and as much as a first one must.
+    ``suns`` and ``windows`` tell which of those of each light, its columns after the sky's, are above the horizon.
+    Errors blur, so a window must explain much more than a sun does, and as much as a first one must.
 
     Without shadows a direction and its opposite have similar gradients: above degree 1 the SH coefficients of a cosine
     lobe are even only (Ramamoorthi & Hanrahan 2001). ``CANDIDATES`` are therefore fitted.
     """
     skies, lights = quadratic.skies, quadratic.lights
+    no_sky, no_suns, no_windows = (np.zeros(n, bool) for n in (skies, len(suns), len(windows)))
+    is_sun = np.append(no_sky, np.tile(np.append(suns, no_windows), lights))
+    is_window = np.append(no_sky, np.tile(np.append(no_suns, windows), lights))
     columns = list(range(skies))
     before, intensity = quadratic.fit(columns)
     sky = slice(0, skies)
@@ -293,9 +293,8 @@ def _search(quadratic: Quadratic, above: NDArray[np.bool_], window: NDArray[np.b
     while len(columns) < min(skies + MAX_LIGHTS * lights, len(quadratic.irradiance)) and before > noise:
         gain = quadratic.gains(columns, intensity)
         gain[columns] = -np.inf
-        gain[skies:][~above] = -np.inf
-        after, best = _best(quadratic, columns, np.where(np.append(np.zeros(skies, bool), window), -np.inf, gain))
-        broad, widest = _best(quadratic, columns, np.where(np.append(np.zeros(skies, bool), ~window), -np.inf, gain))
+        after, best = _best(quadratic, columns, np.where(is_sun, gain, -np.inf))
+        broad, widest = _best(quadratic, columns, np.where(is_window, gain, -np.inf))
         first = FIRST_GAIN * math.sqrt(before * energy) / lights
         least = MIN_GAIN * before / lights if len(columns) > skies else first
         if before - broad > max(BROADER * (before - after), first):
@@ -338,14 +337,14 @@ def _lobe_centres() -> Floats:
     return np.stack([ring * np.cos(azimuth), y, ring * np.sin(azimuth)], axis=1)
 
 
-def _lobes(directions: Floats) -> Floats:
+def _sky(directions: Floats) -> Floats:
     """Sky lobes [K, SKY_LOBES] at ``directions`` [K, 3]."""
-    return np.exp(SKY_SHARPNESS * (directions @ _lobe_centres().T - 1))
+    return _lobes(directions, _lobe_centres(), SKY_SHARPNESS)
 
 
-def _windows(directions: Floats, centres: Floats) -> Floats:
-    """Windows [K, C] around ``centres`` [C, 3] at ``directions`` [K, 3]."""
-    return np.exp(WINDOW_SHARPNESS * (directions @ centres.T - 1))
+def _lobes(directions: Floats, centres: Floats, sharpness: float) -> Floats:
+    """Spherical Gaussians [K, C] around ``centres`` [C, 3] at ``directions`` [K, 3]."""
+    return np.exp(sharpness * (directions @ centres.T - 1))
 
 
 def _texels_near(directions: Floats, centres: Floats) -> NDArray[np.int64]:
