@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch
 
 from rnd_bench.studies.light_hue import hue_difference
-from rnd_runtime.shading.light import Light
+from rnd_bench.studies.trainings import _light_error
+from rnd_runtime.capture.capture import load_capture
+from rnd_runtime.shading.light import Light, texel_directions
+from support.paths import ASSETS
 
 WHITE = np.ones((16, 32, 3), np.float32)
 
@@ -28,3 +34,13 @@ def test_the_same_colours_from_other_sides_differ() -> None:
     right[:, 16:, 0] *= 2
     assert hue_difference(left, Light(right)) > 5
     assert hue_difference(left, Light(left)) == pytest.approx(0, abs=0.01)
+
+
+def test_a_studys_rows_have_it_where_the_true_light_is_known():
+    known = load_capture(ASSETS / "capture")
+    light = known.load_light(known.split("train")[0].light).resized(32, 64)
+    learned = torch.from_numpy(2 * light.sample(texel_directions(32, 64)))
+    checkpoint = SimpleNamespace(probe_of=lambda name: learned)
+    assert _light_error(checkpoint, known) == {"light_hue_de": pytest.approx(0, abs=0.01)}
+    unknown = SimpleNamespace(split=lambda name: [SimpleNamespace(light=None)])
+    assert _light_error(checkpoint, unknown) == {}

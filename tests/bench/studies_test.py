@@ -222,4 +222,5 @@ def test_people_are_trained_scored_and_nothing_is_done_twice(tiny_capture, tmp_p
         results.append(json.loads((tmp_path / "people.json").read_text()))
     first, again = results
     assert first["rows"] and all(row["subject"] == 0 and row["method"] == "ours" for row in first["rows"])
+    assert all("light_hue_de" in row for row in first["rows"])
     assert again["rows"] == first["rows"] and (first["looks"], again["looks"]) == (1, 2)

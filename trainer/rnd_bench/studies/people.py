@@ -22,7 +22,7 @@ from rnd_trainer.losses.perceptual import Perceptual
 
 from .options import PeopleSizes
 from .summary import summarise
-from .trainings import ablate, compare_lights
+from .trainings import ablate
 from .variants import StudyRow
 
 COST_FILE = "cost.json"
@@ -106,18 +106,16 @@ def run_study(
         ) -> None:
             on_run(f"subject {subject}, {name}, seed {seed}", before + of_subject, total)
 
-        runs = folder / f"runs{subject}-{sizes.steps}-{sizes.gaussians}"
         own = ablate(
             capture,
             base,
-            runs,
+            folder / f"runs{subject}-{sizes.steps}-{sizes.gaussians}",
             variants,
             seeds=range(sizes.seeds),
             perceptual=perceptual,
             judge=judge,
             on_run=on_training,
         )
-        own = compare_lights(own, runs, variants, capture)
         done += sizes.seeds * len(variants)
         light = capture.split("train")[0].light
         rows += [{**row, "subject": subject, "train_light": light} for row in own]

@@ -18,7 +18,7 @@ from rnd_runtime.core.files import earlier_rows, sha256_of, write_json
 from rnd_trainer.config import TrainConfig
 from rnd_trainer.evaluation.held_out import score
 from rnd_trainer.losses.perceptual import Perceptual, networks_by_role, networks_sha256
-from rnd_trainer.model.checkpoint import load_checkpoint
+from rnd_trainer.model.checkpoint import Checkpoint, load_checkpoint
 from rnd_trainer.model.model import AvatarModel
 from rnd_trainer.training.data import check_true_normals
 from rnd_trainer.training.lighting.lights import capture_lights
@@ -100,8 +100,8 @@ def ablate(
             extra = _pose_errors(train(seen, config, run_folder, perceptual, consistency, on_share), capture)
             checkpoint = load_checkpoint(run_folder / "avatar.ckpt")
             scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=judge)
-            cost = encoder_cost(checkpoint.model)
-            write_json(run_folder / ROWS, [row | cost | extra for row in scored])
+            extra |= encoder_cost(checkpoint.model) | _light_error(checkpoint, capture)
+            write_json(run_folder / ROWS, [row | extra for row in scored])
             found = _rows(run_folder)
         rows += found
     return rows
@@ -157,22 +157,13 @@ def time_encoders(
     return [row | costs[row["method"]] for row in rows]
 
 
-def compare_lights(
-    rows: list[dict[str, Any]], folder: Path, variants: Sequence[StudyRow], capture: Capture
-) -> list[dict[str, Any]]:
-    """``rows`` with ``light_hue_de``, ``hue_difference`` of the learned light, where the true one is known."""
+def _light_error(checkpoint: Checkpoint, capture: Capture) -> dict[str, float]:
+    """``light_hue_de``, the ``hue_difference`` of the learned light, where the true one is known."""
     light = capture.split("train")[0].light
     if light is None or not capture.has_map(light):
-        return rows
-    true = capture.load_light(light)
-    found = {}
-    for row in rows:
-        name, seed = row["method"], row["seed"]
-        if (name, seed) not in found:
-            variant = next(variant for variant in variants if variant.name == name)
-            checkpoint = load_checkpoint(_run_folder(folder, variant, seed) / "avatar.ckpt")
-            found[name, seed] = hue_difference(checkpoint.probe_of(light).double().numpy(), true)
-    return [row | {"light_hue_de": found[row["method"], row["seed"]]} for row in rows]
+        return {}
+    learned = checkpoint.probe_of(light).double().numpy()
+    return {"light_hue_de": hue_difference(learned, capture.load_light(light))}
 
 
 @torch.no_grad()
