@@ -32,7 +32,7 @@ PLAUSIBLE = np.array([[-1.3, 1.5], [-0.35, 0.35]])
 """least and greatest distance from ``SKIN_CHROMA`` along ``LIGHT_AXES`` that may be skin, not a glove or a beard"""
 AGREEMENT = 0.2
 """distance along either axis within which hands and face are alike: then they are skin, whatever the light"""
-SKIN_LUMINANCE, SKIN_LUMINANCE_DEVIATION = 0.28, 0.5
+SKIN_LUMINANCE, SKIN_LUMINANCE_DEVIATION = 0.26, 0.4
 """median reflectance of skin over people, and the deviation of its logarithm"""
 BODY_LUMINANCE, BODY_DEVIATION = 0.28, 0.35
 """the same of a clothed person's mean: geometric mean and spread of the seven development subjects"""
