@@ -10,7 +10,7 @@ import pytest
 
 from rnd_runtime.capture.capture import Capture
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.images import to_bytes, write_image
+from rnd_runtime.core.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
 from rnd_trainer.importing.images import read_mask
 from rnd_trainer.importing.importer import import_source
 from rnd_trainer.importing.options import FrameSelection, ImportOptions
@@ -142,6 +142,23 @@ def test_sixteen_bits_of_coverage_stay_soft(tmp_path) -> None:
     soft = np.linspace(0, 65535, 64).reshape(8, 8).astype(np.uint16)
     write_image(tmp_path / "m.png", soft)
     assert np.abs(read_mask(tmp_path / "m.png") - soft / 257).max() <= 1
+
+
+def test_a_soft_outline_takes_the_persons_colour_not_the_walls(tmp_path) -> None:
+    red, wall = np.array([180, 40, 40]), np.array([230, 235, 240])
+    coverage = np.clip((10 - np.abs(np.arange(WIDTH) - WIDTH / 2)) / 5, 0, 1) * np.ones((HEIGHT, 1))
+    for k in range(FRAMES):
+        write_image(tmp_path / "masks" / f"{k:05d}.png", to_bytes(coverage))
+        write_image(
+            tmp_path / "frames" / f"{k:05d}.png", np.where(coverage[..., None] == 1, red, wall).astype(np.uint8)
+        )
+    write_poses(tmp_path)
+    capture = _imported(tmp_path)
+    seen = capture.load_frame(capture.frames[0])
+    outline = (seen.mask > 0.1) & (seen.mask < 0.9)
+    expected = linear_to_srgb(srgb_to_linear(red / 255) * seen.mask[outline][:, None])
+    assert outline.any()
+    assert np.abs(seen.image_srgb[outline] - expected).max() < 1.5 / 255
 
 
 @pytest.mark.parametrize("shape", [(4,), (2, 3, 4, 5)])

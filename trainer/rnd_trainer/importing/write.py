@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,8 +19,11 @@ from .dataset import ImportedDataset, Sample
 from .images import Bytes, check_size
 from .options import OnProgress, no_progress
 from .scene import PlacedScene
+from .surfaces.masks import bounding_box, colour_around
 
-_TO_LINEAR = srgb_to_linear(np.arange(256) / 255)
+_TO_LINEAR = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
+_COVERED = 250  # of 255: coverage above which a pixel shows the person alone
+_REACH = 2.5  # pixels, a quarter of the widest outline whose colours are replaced
 
 
 def write_capture(
@@ -77,5 +81,18 @@ def _write_sample(folder: Path, sample: Sample, camera: Camera, frame: int) -> F
 
 
 def _premultiplied(image_srgb: Bytes, mask: Bytes) -> Bytes:
-    """``image_srgb`` [H, W, 3] on black, multiplied by the coverage ``mask`` [H, W] in linear space."""
-    return to_bytes(linear_to_srgb(_TO_LINEAR[image_srgb] * (mask[..., None] / 255.0)))
+    """``image_srgb`` [H, W, 3] on black, multiplied by the coverage ``mask`` [H, W] in linear space.
+
+    Pixels of a soft outline hold the background's colour too: they take that of the covered pixels beside them.
+    """
+    result = np.zeros_like(image_srgb)
+    if not mask.any():
+        return result
+    window = bounding_box(mask > 0, 0)
+    linear, coverage = _TO_LINEAR[image_srgb[window]], mask[window]
+    partly = ((coverage > 0) & (coverage <= _COVERED)).astype(np.uint8)
+    outline = cv2.dilate(partly, np.ones((3, 3), np.uint8)) > 0
+    person, weight = colour_around(linear, (coverage > 0) & ~outline, _REACH)
+    linear = np.where((outline & (weight > 0))[..., None], person, linear)
+    result[window] = to_bytes(linear_to_srgb(linear * (coverage[..., None] / 255.0)))
+    return result

@@ -14,11 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.arrays import spaced_indices
-from rnd_trainer.importing.surfaces.masks import bounding_box, dilated, large_parts, mask_height
+from rnd_trainer.importing.surfaces.masks import (
+    Floats32,
+    bounding_box,
+    colour_around,
+    dilated,
+    large_parts,
+    mask_height,
+)
 
 from .regions import Image
-
-Floats32 = NDArray[np.float32]
 
 MAX_SIDE = 800
 """pixels of the person's height at which masks are made; larger ones are enlarged from it"""
@@ -26,7 +31,7 @@ _ROUNDS = 2  # of the background: the second one knows the person's outline
 _CLEARANCES = (0.04, 0.006)  # of the person's height around the mask, hidden in each round
 _FRAMES, _MAX_BYTES = 40, 600 << 20
 _MIN_SEEN = 3  # frames that show a pixel of the background
-_MIN_NOISE, _MAX_NOISE = 1.5, 12.0  # 8-bit steps of a static camera
+_MIN_NOISE, _MAX_NOISE = 3.5, 12.0  # 8-bit steps of a static camera; beside a person codecs err by more
 _EDGE_NOISE = 0.35  # of a step to the neighbour: codecs and sway move edges
 _DIFFERENCE = 5.0  # half squared deviations from which a pixel is rather the person's
 _EVIDENCE = (-4.0, 8.0)  # log odds that a pixel's difference from the background can give
@@ -166,9 +171,8 @@ def _difference_odds(pixels: Floats32, background: Background) -> Floats32:
 
 def _mixed(alpha: Floats32, pixels: Floats32, background: Background) -> Floats32:
     """``alpha`` with the outline's pixels measured as mixtures of the person's colour nearby and the background's."""
-    sure = cv2.erode((alpha > 0.95).astype(np.float32), np.ones((3, 3), np.uint8))
-    weight = cv2.GaussianBlur(sure, (0, 0), _COLOUR_REACH)
-    person = cv2.GaussianBlur(pixels * sure[..., None], (0, 0), _COLOUR_REACH) / np.maximum(weight, 1e-4)[..., None]
+    sure = cv2.erode((alpha > 0.95).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    person, weight = colour_around(pixels, sure, _COLOUR_REACH)
     across = person - background.colour
     contrast = (across**2).sum(-1)
     share = ((pixels - background.colour) * across).sum(-1) / np.maximum(contrast, 1)

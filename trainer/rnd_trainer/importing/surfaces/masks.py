@@ -21,6 +21,7 @@ from .networks import ImageNetwork
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Floats32 = NDArray[np.float32]
 
 # Shares of the silhouette's height; centimetres for a person of 1.7 m
 _SURE_INSIDE = 0.015  # 2.5 cm: farther inside the template is person
@@ -201,6 +202,14 @@ def _grabcut(image: Image, labels: Image) -> Mask:
     models = np.zeros((1, 65)), np.zeros((1, 65))
     refined, *_ = cv2.grabCut(image, labels.copy(), None, *models, _GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
     return large_parts(np.isin(refined, (cv2.GC_FGD, cv2.GC_PR_FGD)))
+
+
+def colour_around(pixels: Floats32, where: Mask, reach: float) -> tuple[Floats32, Floats32]:
+    """Mean colour [H, W, 3] of the pixels ``where`` within about four times ``reach``, and its weight [H, W]."""
+    counted = where.astype(np.float32)
+    weight = cv2.GaussianBlur(counted, (0, 0), reach)
+    total = cv2.GaussianBlur(pixels * counted[..., None], (0, 0), reach)
+    return np.asarray(total / np.maximum(weight, 1e-12)[..., None], np.float32), np.asarray(weight, np.float32)
 
 
 def large_parts(mask: NDArray[np.generic]) -> Mask:
