@@ -25,7 +25,12 @@ def test_rows_of_levels_and_crowds(tmp_path, monkeypatch):
     assert large["gaussians"] == 12000 and 0 < large["rms_to_whole"] < 1  # fewer nodes
     assert small["gaussians"] < 4000 and 0 < small["rms_to_whole"] < 4
     one, three = rows["crowds"]
-    assert one["gaussians"] == 12000 and three["people"] == 3 and three["ms_median"] > 0 and three["cpu_ms_median"] > 0
+    assert (
+        three["gaussians"] / 3 < one["gaussians"] < 12000
+        and three["people"] == 3
+        and three["ms_median"] > 0
+        and three["cpu_ms_median"] > 0
+    )
     assert {"encoders", "posing", "shading", "raster"} <= set(three["stages"])
     bounds = {row["stage"]: row for row in rows["roofline"] if row["people"] == 3}
     assert {"encoders", "posing", "shading", "projection", "sort", "raster"} == set(bounds)

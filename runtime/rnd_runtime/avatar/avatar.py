@@ -25,7 +25,7 @@ from rnd_runtime.shading.brdf import LARGEST_ALBEDO
 from .file import REST_OUTPUTS
 from .networks import Networks
 
-MIN_GAUSSIANS = 2100
+MIN_GAUSSIANS = 1500
 """of a level that has a coarser one"""
 
 

@@ -37,7 +37,7 @@ from .frame import FrameRenderer, RenderedFrame, features_of, in_root_frame, spl
 from .framing import CameraPath, Framing, frame_motion
 
 _PART_OF_A_FRAME = 1e-4  # tolerance of rounded times
-LEVEL_SPACING, NODE_SPACING = 1.1, 24.0
+LEVEL_SPACING, NODE_SPACING = 1.3, 48.0
 """px, spacings of the Gaussians and of the nodes up to which a coarser level is taken: neighbouring levels then differ
 by 1/255 at most, as root mean square over the body's box (``rnd-bench scenes``)"""
 HYSTERESIS = 1.15
@@ -152,10 +152,11 @@ class SceneRenderer:
         self._arrays: dict[str, NDArray[Any]] = {}
 
     def levels(self, count: int, fps: float, camera_at: CameraPath, *, start: float = 0.0) -> NDArray[np.intp]:
-        """Level of detail [F, N] of each person in ``count`` frames from ``start`` s on; a lone one has the finest."""
+        """Level of detail [F, N] of each person in ``count`` frames from ``start`` s on.
+
+        A lone one that needs all its Gaussians has the finest, which is drawn on the renderer's device at once.
+        """
         levels = np.zeros((count, len(self.people)), np.intp)
-        if len(self.people) == 1:
-            return levels
         times_s = start + np.arange(count) / fps
         cameras = [camera_at(frame, time_s) for frame, time_s in enumerate(times_s.tolist())]
         axes = np.array([[*camera.world_to_camera[2], max(camera.K[0, 0], camera.K[1, 1])] for camera in cameras])
@@ -163,6 +164,10 @@ class SceneRenderer:
             depths = (person.positions(times_s) * axes[:, :3]).sum(axis=1) + axes[:, 3] - MARGIN
             sizes = np.divide(axes[:, 4], depths, out=np.full(len(depths), np.inf), where=depths > NEAR)
             levels[:, number] = chosen_levels(sizes, greatest_sizes(person.avatar, float(sizes.min())))
+        if len(self.people) == 1:
+            made = [person.avatar.level(number) for number in range(int(levels.max(initial=0)) + 1)]
+            whole = [level is None or level.gaussians == person.avatar.gaussians for level in made]
+            levels[np.array(whole)[levels]] = 0
         return levels
 
     def encode(self, time_s: float, levels: Sequence[int] | None = None) -> list[Encoded]:
@@ -188,7 +193,7 @@ class SceneRenderer:
             ground_light: the renderer's by default.
         """
         given = given or [{}] * len(bodies)
-        if len(bodies) == 1 and change is None:
+        if len(bodies) == 1 and bodies[0].avatar is self.renderer.avatar and change is None:
             return self.renderer.draw(bodies[0], camera, aovs=aovs, srgb=srgb, given=given[0])
         seconds, started = {}, perf_counter()
         frame = bodies[0].root

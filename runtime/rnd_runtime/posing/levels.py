@@ -19,7 +19,7 @@ from .rest import RestPose
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
-KEPT = 0.97
+KEPT = 0.98
 """share of the Gaussians that the next coarser level keeps"""
 NODES_SHARES = (4, 16)
 """nodes for each one that the first levels keep: 0.6 and 0.9/255 of difference at any size"""

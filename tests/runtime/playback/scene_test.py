@@ -176,7 +176,13 @@ def test_far_people_get_coarser_levels_and_parts_of_a_run_the_same(avatar, motio
             (np.diff(levels[:, 0]) >= 0).all() and levels[0, 0] < levels[-1, 0] and (levels[:, 1] >= levels[:, 0]).all()
         )
         np.testing.assert_array_equal(scene.levels(5, 30.0, camera_at), levels[:5])
-        assert not SceneRenderer(people[:1], renderer).levels(8, 30.0, camera_at).any()
+        alone = SceneRenderer(people[:1], renderer)
+        np.testing.assert_array_equal(alone.levels(8, 30.0, camera_at)[:, 0], levels[:, 0])
+        near = Camera.look_at([0, 1, 4], [0, 1, 0], width=800, height=800, fov_y=0.8)
+        assert greatest_sizes(avatar)[1] > near.K[0, 0] / 4 and not alone.levels(2, 30.0, lambda *_: near).any()
+        small = alone.draw(alone.encode(0.2, [int(levels[-1, 0])]), camera_at(7, 0.0))
+        whole = alone.draw(alone.encode(0.2), camera_at(7, 0.0))
+        assert np.sqrt(np.mean((small.srgb.astype(float) - whole.srgb) ** 2)) < 1
         full, coarse = (
             scene.draw(scene.encode(0.2, chosen), camera_at(2, 0.0)) for chosen in (None, levels[2].tolist())
         )
