@@ -28,7 +28,7 @@ def main(folder: Path, out: Path, names: list[str]) -> None:
     if len(strips) > 1 and len(strips) % 2:
         strips.append(np.zeros_like(strips[-1]))
     rows = [np.concatenate(strips[k : k + 2], axis=1) for k in range(0, len(strips), 2)]
-    words = captions(SHOWN[1], len(strips[:2]))
+    words = captions(TILES * len(strips[:2]), SHOWN[1])
     write_image(out, np.concatenate([words, *rows], axis=0))
 
 

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 
+import numpy as np
 import pytest
 import torch
 from msgspec import structs
 
 from rnd_bench.cli import main
 from rnd_bench.studies import people, trainings
+from rnd_bench.studies.people_sheet import WORDS
 from rnd_bench.studies.summary import summarise
 from rnd_bench.studies.trainings import ablate, check_needs, encoder_cost, time_encoders
 from rnd_bench.studies.variants import CAUSES, VARIANTS, StudyRow, chosen
+from rnd_runtime.capture.capture import load_capture, save_capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import sha256_of, write_json
+from rnd_runtime.core.images import read_image
 from rnd_trainer.config import to_dict
+from rnd_trainer.evaluation.preview import CAPTION
 from rnd_trainer.model.checkpoint import write_tensors
 from rnd_trainer.training.state import STATE_FILE, STATE_SCHEMA
 from rnd_trainer.training.training import Training
@@ -208,14 +214,25 @@ def test_every_person_counts_once() -> None:
     assert plain["psnr"] == pytest.approx(21) and plain["ssim"] is None
 
 
+def _as_on_the_stage(capture, folder):
+    """``capture`` with true albedo, and with its novel views once more as under another light."""
+    shutil.copytree(capture.folder, folder)
+    frames = [structs.replace(frame, albedo=frame.image) for frame in capture.frames]
+    frames += [structs.replace(f, split="relight", light="other") for f in frames if f.split == "novel_view"]
+    lights = capture.lights | {"other": capture.lights["white"]}
+    save_capture(dataclasses.replace(capture, folder=folder, frames=tuple(frames), lights=lights))
+    return load_capture(folder)
+
+
 @pytest.mark.slow
 def test_people_are_trained_scored_and_nothing_is_done_twice(tiny_capture, tmp_path, monkeypatch) -> None:
     """By the command, of a subject that is filmed already."""
     pytest.importorskip("mitsuba")
     monkeypatch.setattr(people, "film_subjects", lambda *words: None)
-    (tmp_path / "subject0").symlink_to(tiny_capture.folder)
+    capture = _as_on_the_stage(tiny_capture, tmp_path / "subject0")
     sizes = ["--subjects", "1", "--seeds", "1", "--steps", "4", "--gaussians", "400", "--variant", "scalar_rgb"]
-    words = ["study", "people", str(tmp_path), "--json", str(tmp_path / "people.json"), "--methods", "ours", *sizes]
+    files = ["--json", str(tmp_path / "people.json"), "--sheet", str(tmp_path / "people.png")]
+    words = ["study", "people", str(tmp_path), *files, "--methods", "ours", *sizes]
     results = []
     for _ in range(2):
         assert main(words) == 0
@@ -223,4 +240,9 @@ def test_people_are_trained_scored_and_nothing_is_done_twice(tiny_capture, tmp_p
     first, again = results
     assert first["rows"] and all(row["subject"] == 0 and row["method"] == "ours" for row in first["rows"])
     assert all("light_hue_de" in row for row in first["rows"])
+    relit, side = capture.split("relight"), 64
+    sheet = read_image(tmp_path / "people.png")
+    assert sheet.shape == (CAPTION + side, len(WORDS) * side, 3)
+    truth = capture.load_frame(relit[len(relit) // 2]).image_srgb
+    np.testing.assert_allclose(sheet[CAPTION:, 4 * side : 5 * side] / 255, truth, atol=1 / 254)
     assert again["rows"] == first["rows"] and (first["looks"], again["looks"]) == (1, 2)

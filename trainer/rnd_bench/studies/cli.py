@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,11 @@ def _show(summary: Sequence[dict[str, Any]], study: str) -> None:
     _wide_console().print(table)
 
 
+def _check_sheet(file: Path | None) -> None:
+    if file is not None:
+        check_option(file.suffix.lower() == ".png", "--sheet", "a .png", file.name)
+
+
 def _with_gain(cell: dict[str, Any]) -> str:
     """Mean ± deviation, and the gain over the variant beside; in brackets where the seeds differ by more."""
     text = f"{cell['mean']:.2f}" + ("" if cell["spread"] is None else f" ± {cell['spread']:.2f}")
@@ -118,14 +124,15 @@ def run_people(options: People) -> None:
     """Render every subject, train, score; print the means, write the rows."""
     need_extra()
     options.sizes.check()
+    _check_sheet(options.sheet)
     variant = use_variant(options.variant)
-    from .people import FIGURES, film_subjects, looks_before, run_study
+    from .people import FIGURES, film_subjects, looks_before, run_study, write_sheet
 
     variants = chosen(list({row.name: row for row in (*VARIANTS, *CAUSES)}.values()), options.methods)
     perceptual, judge = load_lpips(options.perceptual_weights), load_lpips(options.judge_weights)
     output_folder(options.out)
-    if options.json is not None:
-        output_file(options.json)
+    for file in filter(None, (options.json, options.sheet)):
+        output_file(file)
     with Progress() as progress:
         progress.phase("rendering")
         film_subjects(
@@ -139,6 +146,8 @@ def run_people(options: People) -> None:
         result = run_study(options.sizes, options.out, variants, perceptual=perceptual, judge=judge, on_run=on_run)
     if options.json is not None:
         write_json(options.json, {"looks": looks_before(options.json) + 1, **result})
+    if options.sheet is not None:
+        write_sheet(options.sizes, options.out, variants[0], options.sheet)
     table = Table("method", "split", *FIGURES, title=f"means of {options.sizes.subjects} subjects")
     for line in result["means"]:
         cells = ("" if line[figure] is None else f"{line[figure]:.4g}" for figure in FIGURES)
@@ -152,8 +161,7 @@ def run_agreement(options: Agreement) -> None:
     check_option(options.size >= 16, "--size", "at least 16", options.size)
     check_option(options.samples >= 2, "--samples", "at least 2", options.samples)
     check_step(options.step)
-    if options.sheet is not None:
-        check_option(options.sheet.suffix.lower() == ".png", "--sheet", "a .png", options.sheet.name)
+    _check_sheet(options.sheet)
     for file in filter(None, (options.json, options.sheet)):
         output_file(file)
     variant = use_variant(options.variant)

@@ -139,6 +139,8 @@ class People:
     """folder for captures and trainings"""
     json: OptionalFile = None
     """write summary, cost and rows here"""
+    sheet: OptionalFile = None
+    """write a PNG of every subject: truth and the first of the methods, albedo, another light, both light maps"""
     methods: Annotated[tuple[str, ...], option("NAME ...")] = ("ours", "static skinning", "LBS, plain colour")
     """variants to train, such as "true light\""""
     perceptual_weights: OptionalFile = None

@@ -19,10 +19,12 @@ from rnd_stage.film.manifest import write_manifest
 from rnd_stage.film.plan import image_count, missing
 from rnd_trainer.config import preset, resized
 from rnd_trainer.losses.perceptual import Perceptual
+from rnd_trainer.model.checkpoint import load_checkpoint
 
 from .options import PeopleSizes
+from .people_sheet import write_people_sheet
 from .summary import summarise
-from .trainings import ablate
+from .trainings import ablate, folder_of
 from .variants import StudyRow
 
 COST_FILE = "cost.json"
@@ -109,7 +111,7 @@ def run_study(
         own = ablate(
             capture,
             base,
-            folder / f"runs{subject}-{sizes.steps}-{sizes.gaussians}",
+            _runs(sizes, folder, subject),
             variants,
             seeds=range(sizes.seeds),
             perceptual=perceptual,
@@ -127,6 +129,19 @@ def run_study(
         "cost": _cost(folder, sizes, rows, time.perf_counter() - started),
         "rows": rows,
     }
+
+
+def _runs(sizes: PeopleSizes, folder: Path, subject: int) -> Path:
+    return folder / f"runs{subject}-{sizes.steps}-{sizes.gaussians}"
+
+
+def write_sheet(sizes: PeopleSizes, folder: Path, variant: StudyRow, file: Path) -> None:
+    """Write ``people_sheet`` of the first training of every subject with ``variant``."""
+    people = []
+    for subject in sizes.seeds_of_people:
+        trained = folder_of(_runs(sizes, folder, subject), variant, 0) / "avatar.ckpt"
+        people.append((load_checkpoint(trained), load_capture(folder / f"subject{subject}")))
+    write_people_sheet(file, people)
 
 
 def looks_before(file: Path) -> int:

@@ -77,7 +77,7 @@ def ablate(
                 FEATURES: networks_sha256(consistency or perceptual),
                 **learned,
             }
-            run_folder = _run_folder(folder, variant, seed)
+            run_folder = folder_of(folder, variant, seed)
             found = _rows(run_folder)
             if found:
                 _refuse_others(found[0], same, "done", run_folder / ROWS)
@@ -95,7 +95,7 @@ def ablate(
 
         on_share(0.0)
         if not found:
-            run_folder = _run_folder(folder, variant, seed)
+            run_folder = folder_of(folder, variant, seed)
             seen = _noisy(capture) if variant.noisy else capture
             extra = _pose_errors(train(seen, config, run_folder, perceptual, consistency, on_share), capture)
             checkpoint = load_checkpoint(run_folder / "avatar.ckpt")
@@ -151,7 +151,7 @@ def time_encoders(
 ) -> list[dict[str, Any]]:
     """``rows`` with every variant's ``encoder_cost`` measured in sequence on its avatar of ``seed``."""
     costs = {
-        variant.name: encoder_cost(load_checkpoint(_run_folder(folder, variant, seed) / "avatar.ckpt").model)
+        variant.name: encoder_cost(load_checkpoint(folder_of(folder, variant, seed) / "avatar.ckpt").model)
         for variant in variants
     }
     return [row | costs[row["method"]] for row in rows]
@@ -218,6 +218,7 @@ def _pose_errors(training: Training, truth: Capture) -> dict[str, float]:
     }
 
 
-def _run_folder(folder: Path, variant: StudyRow, seed: int) -> Path:
+def folder_of(folder: Path, variant: StudyRow, seed: int) -> Path:
+    """Where one training of the study in ``folder`` is."""
     slug = "".join(c if c.isalnum() else "_" for c in variant.name).strip("_").lower()
     return folder / f"{slug}-{seed}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -59,10 +60,10 @@ def contact_sheet(path: Path, strips: list[np.ndarray], rows: int = 6) -> None:
     _write_sheet(path, [strips[k * len(strips) // count] for k in range(count)])
 
 
-def captions(tile: int, strips: int = 1) -> np.ndarray:
-    """[CAPTION, 5·tile·strips, 3] uint8: a caption for each tile of ``tile`` pixels, grey on black."""
-    image = np.zeros((CAPTION, tile * len(TILES) * strips, 3), np.uint8)
-    for number, word in enumerate(TILES * strips):
+def captions(words: Sequence[str], tile: int) -> np.ndarray:
+    """[CAPTION, tile·words, 3] uint8: a caption for each tile of ``tile`` pixels, grey on black."""
+    image = np.zeros((CAPTION, tile * len(words), 3), np.uint8)
+    for number, word in enumerate(words):
         (wide, _), _ = cv2.getTextSize(word, FONT, LETTERS, 1)
         scale = LETTERS * min(1.0, 0.9 * tile / wide)
         left = number * tile + round((tile - wide * scale / LETTERS) / 2)
@@ -74,7 +75,7 @@ def _write_sheet(path: Path, strips: list[np.ndarray]) -> None:
     """Write strips below captions; narrower images are centred in their columns."""
     tile = max(strip.shape[1] for strip in strips) // len(TILES)
     columns = [_centred(strip, tile) for strip in strips]
-    write_image(path, np.concatenate([captions(tile), *columns], axis=0))
+    write_image(path, np.concatenate([captions(TILES, tile), *columns], axis=0))
 
 
 def _centred(strip: np.ndarray, tile: int) -> np.ndarray:
