@@ -214,6 +214,12 @@ def test_every_person_counts_once() -> None:
     assert plain["psnr"] == pytest.approx(21) and plain["ssim"] is None
 
 
+def test_the_type_of_skin_is_the_persons() -> None:
+    pytest.importorskip("mitsuba")
+    assert [people._told(people.SKIN_KNOWN, number).train for number in (1, 2)] == [{"skin": 1}, {"skin": 5}]
+    assert people._told(VARIANTS[0], 1) is VARIANTS[0]
+
+
 def _as_on_the_stage(capture, folder):
     """``capture`` with true albedo, and with its novel views once more as under another light."""
     shutil.copytree(capture.folder, folder)

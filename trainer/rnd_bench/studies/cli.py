@@ -126,9 +126,9 @@ def run_people(options: People) -> None:
     options.sizes.check()
     _check_sheet(options.sheet)
     variant = use_variant(options.variant)
-    from .people import FIGURES, film_subjects, looks_before, run_study, write_sheet
+    from .people import FIGURES, SKIN_KNOWN, film_subjects, looks_before, run_study, write_sheet
 
-    variants = chosen(list({row.name: row for row in (*VARIANTS, *CAUSES)}.values()), options.methods)
+    variants = chosen(list({row.name: row for row in (*VARIANTS, *CAUSES, SKIN_KNOWN)}.values()), options.methods)
     perceptual, judge = load_lpips(options.perceptual_weights), load_lpips(options.judge_weights)
     output_folder(options.out)
     for file in filter(None, (options.json, options.sheet)):

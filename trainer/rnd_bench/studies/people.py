@@ -10,16 +10,21 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.core.files import write_json
 from rnd_runtime.core.signals import at_end
 from rnd_runtime.playback.doctor import machine
+from rnd_runtime.shading.light import REC709_LUMINANCE
 from rnd_stage.film.film import film, prepare, recipe_for
 from rnd_stage.film.manifest import write_manifest
 from rnd_stage.film.plan import image_count, missing
+from rnd_stage.people import subjects
 from rnd_trainer.config import preset, resized
 from rnd_trainer.losses.perceptual import Perceptual
 from rnd_trainer.model.checkpoint import load_checkpoint
+from rnd_trainer.training.lighting.skin import TONES
 
 from .options import PeopleSizes
 from .people_sheet import write_people_sheet
@@ -30,6 +35,7 @@ from .variants import StudyRow
 COST_FILE = "cost.json"
 FIGURES = ("psnr", "psnr_person", "ssim", "lpips", "psnr_n", "normal_deg", "psnr_albedo", "light_hue_de", "flicker")
 """metrics of rnd-eval and ``light_hue_de``, averaged over the subjects"""
+SKIN_KNOWN = StudyRow("skin known", "--skin of each person's type", "ours")
 
 
 def film_subjects(sizes: PeopleSizes, folder: Path, variant: str, on_image: Callable[[int, int], None]) -> None:
@@ -112,7 +118,7 @@ def run_study(
             capture,
             base,
             _runs(sizes, folder, subject),
-            variants,
+            [_told(variant, subject) for variant in variants],
             seeds=range(sizes.seeds),
             perceptual=perceptual,
             judge=judge,
@@ -129,6 +135,15 @@ def run_study(
         "cost": _cost(folder, sizes, rows, time.perf_counter() - started),
         "rows": rows,
     }
+
+
+def _told(variant: StudyRow, subject: int) -> StudyRow:
+    """``SKIN_KNOWN`` with the type of skin that reflects most nearly as the ``subject``'s does; others as they are."""
+    if variant is not SKIN_KNOWN:
+        return variant
+    reflected = float(np.dot(subjects.subject(subject).palette.skin, REC709_LUMINANCE))
+    kind = 1 + int(np.argmin(np.abs(np.log(np.divide(TONES, reflected)))))
+    return dataclasses.replace(variant, train={"skin": kind})
 
 
 def _runs(sizes: PeopleSizes, folder: Path, subject: int) -> Path:
