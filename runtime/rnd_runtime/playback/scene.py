@@ -163,11 +163,12 @@ class SceneRenderer:
         for number, person in enumerate(self.people):
             depths = (person.positions(times_s) * axes[:, :3]).sum(axis=1) + axes[:, 3] - MARGIN
             sizes = np.divide(axes[:, 4], depths, out=np.full(len(depths), np.inf), where=depths > NEAR)
-            levels[:, number] = chosen_levels(sizes, greatest_sizes(person.avatar, float(sizes.min())))
+            smallest, avatar = float(sizes.min()), person.avatar
+            if len(self.people) > 1 or smallest < LEVEL_SPACING / avatar.spacing:
+                levels[:, number] = chosen_levels(sizes, greatest_sizes(avatar, smallest))
         if len(self.people) == 1:
-            made = [person.avatar.level(number) for number in range(int(levels.max(initial=0)) + 1)]
-            whole = [level is None or level.gaussians == person.avatar.gaussians for level in made]
-            levels[np.array(whole)[levels]] = 0
+            made = [avatar.level(number) for number in range(int(levels.max(initial=0)) + 1)]
+            levels[np.array([level is None or level.gaussians == avatar.gaussians for level in made])[levels]] = 0
         return levels
 
     def encode(self, time_s: float, levels: Sequence[int] | None = None) -> list[Encoded]:
