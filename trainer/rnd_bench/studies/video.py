@@ -23,6 +23,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import output_file, output_folder, write_json
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.playback.doctor import machine
+from rnd_trainer.checking.silhouette import mask_iou
 from rnd_trainer.estimating.fit import Estimate, estimate
 from rnd_trainer.estimating.fitting.figure import JOINTS
 from rnd_trainer.estimating.observations import Observations
@@ -55,7 +56,7 @@ def run(options: Video) -> None:
             rows += list(_real(options.real, out))
     if options.json is not None:
         write_json(options.json, {"machine": machine(), "rows": rows})
-    figures = ("absolute_mm", "root_relative_mm", "pa_mm", "outline_iou", "seconds_a_frame")
+    figures = ("absolute_mm", "root_relative_mm", "pa_mm", "mask_iou", "outline_iou", "seconds_a_frame")
     table = Table("video", "given", *figures)
     for row in rows:
         table.add_row(row["video"], row["given"], *(f"{row[f]:.3g}" if row.get(f) is not None else "" for f in figures))
@@ -72,6 +73,8 @@ def _rendered(capture: Capture, seen: Observations) -> Iterator[dict[str, Any]]:
     moved = skeleton.joint_transforms(capture.motion.rotations[index], capture.motion.translations[index])
     truth = _in_camera(moved[:, :, :3, 3], camera)
     masks = [capture.load_frame(frame).mask > 0.5 for frame in chosen[::IOU_EVERY]]
+    found_masks = [seen.masks[k] > 127 for k in range(0, len(seen), IOU_EVERY)]
+    of_masks = float(np.mean([mask_iou(*pair) for pair in zip(found_masks, masks)]))
     own = {"body": capture.body, "focal_px": float(camera.K[0, 0])}
     for given, options in (("nothing", {}), ("body and focal length", own)):
         start = time.process_time()
@@ -85,6 +88,7 @@ def _rendered(capture: Capture, seen: Observations) -> Iterator[dict[str, Any]]:
             "frames": len(seen),
             **every,
             "limbs": limbs,
+            "mask_iou": of_masks,
             "outline_iou": outline_iou(found, masks, IOU_EVERY),
             "focal_px": float(found.camera.K[0, 0]),
             "true_focal_px": float(camera.K[0, 0]),
@@ -165,5 +169,5 @@ def outline_iou(found: Estimate, masks: Sequence[NDArray[np.bool_]], every: int)
         drawn = np.zeros(mask.shape, np.uint8)
         for triangle in (16 * pixels[found.body.faces]).astype(np.int32):
             cv2.fillConvexPoly(drawn, triangle, 1, shift=4)
-        overlaps.append((mask & (drawn > 0)).sum() / max((mask | (drawn > 0)).sum(), 1))
+        overlaps.append(mask_iou(mask, drawn > 0))
     return float(np.mean(overlaps))
