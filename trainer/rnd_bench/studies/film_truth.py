@@ -23,6 +23,7 @@ from rnd_stage.film.estimates import estimated_motion
 from rnd_trainer.estimating.observations import Observations
 from rnd_trainer.importing.images import undistort_image
 from rnd_trainer.importing.videos.video_file import VideoFile
+from rnd_trainer.importing.write import premultiplied
 
 from .video import LIMBS, pa_mm
 
@@ -174,7 +175,7 @@ class Filmed:
             number = int(seen.frames[k])
             image, mask = (undistort_image(a, camera, distortion) for a in (video.frame(number), seen.masks[k]))
             stem = f"{name}_{number:04d}"
-            write_image(out / "images" / f"{stem}.png", np.round(image * (mask[..., None] / 255)).astype(np.uint8))
+            write_image(out / "images" / f"{stem}.png", premultiplied(image, mask))
             write_image(out / "masks" / f"{stem}.png", mask)
             yield Frame(f"images/{stem}.png", f"masks/{stem}.png", name, number, "novel_view")
 

@@ -19,11 +19,11 @@ from .dataset import ImportedDataset, Sample
 from .images import Bytes, check_size
 from .options import OnProgress, no_progress
 from .scene import PlacedScene
-from .surfaces.masks import bounding_box, colour_around
+from .surfaces.masks import Floats32, bounding_box, colour_around
 
-_TO_LINEAR = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
-_COVERED = 250  # of 255: coverage above which a pixel shows the person alone
-_REACH = 2.5  # pixels, a quarter of the widest outline whose colours are replaced
+_TO_LINEAR: Floats32 = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
+_COVERED = 0.98  # coverage above which a pixel shows the person alone
+_REACH = 2.5  # pixels, a quarter of the distance from which colours are taken
 
 
 def write_capture(
@@ -64,10 +64,10 @@ def _write_sample(folder: Path, sample: Sample, camera: Camera, frame: int) -> F
         albedo = None if sample.albedo is None else check_size(sample.albedo(), camera, "albedo")
     except InputError as error:
         raise error.at(frame=sample.frame) from error
-    write_image(folder / "images" / name, _premultiplied(image, mask))
+    write_image(folder / "images" / name, premultiplied(image, mask))
     write_image(folder / "masks" / name, mask)
     if albedo is not None:
-        write_image(folder / "albedo_estimates" / name, _premultiplied(albedo, mask))
+        write_image(folder / "albedo_estimates" / name, premultiplied(albedo, mask))
     if normals is not None:
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
         known = (length > 0.1) & (mask[..., None] > 0)
@@ -80,19 +80,26 @@ def _write_sample(folder: Path, sample: Sample, camera: Camera, frame: int) -> F
     return Frame(*files, sample.camera, frame, sample.split, normal=normal, albedo_estimate=estimate)
 
 
-def _premultiplied(image_srgb: Bytes, mask: Bytes) -> Bytes:
-    """``image_srgb`` [H, W, 3] on black, multiplied by the coverage ``mask`` [H, W] in linear space.
-
-    Pixels of a soft outline hold the background's colour too: they take that of the covered pixels beside them.
-    """
+def premultiplied(image_srgb: Bytes, mask: Bytes) -> Bytes:
+    """``image_srgb`` [H, W, 3] on black, multiplied by the coverage ``mask`` [H, W] in linear space."""
     result = np.zeros_like(image_srgb)
-    if not mask.any():
-        return result
-    window = bounding_box(mask > 0, 0)
-    linear, coverage = _TO_LINEAR[image_srgb[window]], mask[window]
-    partly = ((coverage > 0) & (coverage <= _COVERED)).astype(np.uint8)
-    outline = cv2.dilate(partly, np.ones((3, 3), np.uint8)) > 0
-    person, weight = colour_around(linear, (coverage > 0) & ~outline, _REACH)
-    linear = np.where((outline & (weight > 0))[..., None], person, linear)
-    result[window] = to_bytes(linear_to_srgb(linear * (coverage[..., None] / 255.0)))
+    if mask.any():
+        window = bounding_box(mask > 0, 0)
+        coverage = np.asarray(mask[window] / 255, np.float32)
+        linear = _without_background(_TO_LINEAR[image_srgb[window]], coverage)
+        result[window] = to_bytes(linear_to_srgb(linear * coverage[..., None]))
     return result
+
+
+def _without_background(linear: Floats32, coverage: Floats32) -> Floats32:
+    """``linear`` [H, W, 3] with the background's share taken out of a soft outline's pixels.
+
+    That share is measured between the colours of person and background nearby, and at most what ``coverage`` leaves.
+    """
+    least = cv2.erode(coverage, np.ones((3, 3), np.uint8))
+    person, known = colour_around(linear, least > _COVERED, _REACH)
+    behind, seen = colour_around(linear, coverage == 0, _REACH)
+    across = person - behind
+    share = ((person - linear) * across).sum(-1) / np.maximum((across**2).sum(-1), 1e-6)
+    share = np.clip(np.minimum(share, 1 - least), 0, None) * ((known > 0) & (seen > 0))
+    return np.asarray(linear + share[..., None] * across, np.float32)
