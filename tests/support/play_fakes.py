@@ -34,6 +34,7 @@ def fake_skeleton() -> Skeleton:
 
 
 class Encoded(NamedTuple):
+    avatar: FakeAvatar
     motion: Motion
     time: float
     bones: np.ndarray  # [J, 3, 4] m, rest pose → world
@@ -58,7 +59,7 @@ class FakeAvatar:
         now = motion.at([time])
         joints = self.skeleton.joint_transforms(now.rotations[0], now.translations[0])[:, :3]
         joints[:, :, 3] -= np.einsum("jab,jb->ja", joints[:, :, :3], self.skeleton.rest_joints)
-        return Encoded(motion, time, joints, np.eye(4), {})
+        return Encoded(self, motion, time, joints, np.eye(4), {})
 
     def posed(self, encoded: Encoded) -> Gaussians:
         return self.pose(encoded.motion, encoded.time)

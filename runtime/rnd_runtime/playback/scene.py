@@ -166,8 +166,8 @@ class SceneRenderer:
             smallest, avatar = float(sizes.min()), person.avatar
             if len(self.people) > 1 or smallest < LEVEL_SPACING / avatar.spacing:
                 levels[:, number] = chosen_levels(sizes, greatest_sizes(avatar, smallest))
-        if len(self.people) == 1:
-            made = [avatar.level(number) for number in range(int(levels.max(initial=0)) + 1)]
+        if len(self.people) == 1 and levels.any():
+            made = [avatar.level(number) for number in range(int(levels.max()) + 1)]
             levels[np.array([level is None or level.gaussians == avatar.gaussians for level in made])[levels]] = 0
         return levels
 
