@@ -95,6 +95,7 @@ def _without_background(linear: Floats32, coverage: Floats32) -> Floats32:
     """``linear`` [H, W, 3] with the background's share taken out of a soft outline's pixels.
 
     That share is measured between the colours of person and background nearby, and at most what ``coverage`` leaves.
+    The more there is, the more the person's colour nearby takes its place: what remains is the codec's noise.
     """
     least = cv2.erode(coverage, np.ones((3, 3), np.uint8))
     person, known = colour_around(linear, least > _COVERED, _REACH)
@@ -102,4 +103,5 @@ def _without_background(linear: Floats32, coverage: Floats32) -> Floats32:
     across = person - behind
     share = ((person - linear) * across).sum(-1) / np.maximum((across**2).sum(-1), 1e-6)
     share = np.clip(np.minimum(share, 1 - least), 0, None) * ((known > 0) & (seen > 0))
-    return np.asarray(linear + share[..., None] * across, np.float32)
+    own = linear + share[..., None] * across
+    return np.asarray(own + share[..., None] * (person - own), np.float32)
