@@ -97,8 +97,8 @@ def _without_background(linear: Floats32, coverage: Floats32) -> Floats32:
     That share is measured between the colours of person and background nearby, and at most what ``coverage`` leaves.
     The more there is, the more the person's colour nearby takes its place: what remains is the codec's noise.
     """
-    least = cv2.erode(coverage, np.ones((3, 3), np.uint8))
-    person, known = colour_around(linear, least > _COVERED, _REACH)
+    least = cv2.erode(np.where(coverage > 0, coverage, np.float32(1)), np.ones((3, 3), np.uint8))  # of soft edges alone
+    person, known = colour_around(linear, (coverage > 0) & (least > _COVERED), _REACH)
     behind, seen = colour_around(linear, coverage == 0, _REACH)
     across = person - behind
     share = ((person - linear) * across).sum(-1) / np.maximum((across**2).sum(-1), 1e-6)
