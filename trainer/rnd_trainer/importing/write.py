@@ -19,7 +19,7 @@ from .dataset import ImportedDataset, Sample
 from .images import Bytes, check_size
 from .options import OnProgress, no_progress
 from .scene import PlacedScene
-from .surfaces.masks import Floats32, bounding_box, colour_around
+from .surfaces.masks import Floats32, bounding_box, colour_around, share_of_person
 
 _TO_LINEAR: Floats32 = srgb_to_linear(np.arange(256) / 255).astype(np.float32)
 _COVERED = 0.98  # coverage above which a pixel shows the person alone
@@ -100,8 +100,7 @@ def _without_background(linear: Floats32, coverage: Floats32) -> Floats32:
     least = cv2.erode(np.where(coverage > 0, coverage, np.float32(1)), np.ones((3, 3), np.uint8))  # of soft edges alone
     person, known = colour_around(linear, (coverage > 0) & (least > _COVERED), _REACH)
     behind, seen = colour_around(linear, coverage == 0, _REACH)
-    across = person - behind
-    share = ((person - linear) * across).sum(-1) / np.maximum((across**2).sum(-1), 1e-6)
-    share = np.clip(np.minimum(share, 1 - least), 0, None) * ((known > 0) & (seen > 0))
-    own = linear + share[..., None] * across
-    return np.asarray(own + share[..., None] * (person - own), np.float32)
+    taken = np.minimum(1 - share_of_person(linear, person, behind), 1 - least)
+    share = (np.maximum(taken, 0) * ((known > 0) & (seen > 0)))[..., None]
+    own = linear + share * (person - behind)
+    return np.asarray(own + share * (person - own), np.float32)

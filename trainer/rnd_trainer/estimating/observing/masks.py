@@ -21,6 +21,7 @@ from rnd_trainer.importing.surfaces.masks import (
     dilated,
     large_parts,
     mask_height,
+    share_of_person,
 )
 
 from .regions import Image
@@ -173,9 +174,8 @@ def _mixed(alpha: Floats32, pixels: Floats32, background: Background) -> Floats3
     """``alpha`` with the outline's pixels measured as mixtures of the person's colour nearby and the background's."""
     sure = cv2.erode((alpha > 0.95).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     person, weight = colour_around(pixels, sure, _COLOUR_REACH)
-    across = person - background.colour
-    contrast = (across**2).sum(-1)
-    share = ((pixels - background.colour) * across).sum(-1) / np.maximum(contrast, 1)
+    contrast = ((person - background.colour) ** 2).sum(-1)
+    share = share_of_person(pixels, person, background.colour)
     trust = contrast / (contrast + (_MIN_CONTRAST * _deviation(background)) ** 2)
     edge = cv2.dilate((np.abs(alpha - 0.5) < 0.45).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     trust = np.where(edge & background.seen & (weight > 0.02), trust, 0)

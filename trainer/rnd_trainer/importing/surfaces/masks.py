@@ -212,6 +212,13 @@ def colour_around(pixels: Floats32, where: Mask, reach: float) -> tuple[Floats32
     return np.asarray(total / np.maximum(weight, 1e-12)[..., None], np.float32), np.asarray(weight, np.float32)
 
 
+def share_of_person(pixels: Floats32, person: Floats32, behind: Floats32) -> Floats32:
+    """Share [H, W] of the colour ``person`` in mixtures [H, W, 3] with ``behind``, unbounded; 1 where both are alike."""
+    across = person - behind
+    share = (((pixels - behind) * across).sum(-1) + 1e-6) / ((across**2).sum(-1) + 1e-6)
+    return np.asarray(share, np.float32)
+
+
 def large_parts(mask: NDArray[np.generic]) -> Mask:
     """``mask`` without components below a twentieth of the largest one."""
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
