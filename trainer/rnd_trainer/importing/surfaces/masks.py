@@ -213,7 +213,7 @@ def colour_around(pixels: Floats32, where: Mask, reach: float) -> tuple[Floats32
 
 
 def share_of_person(pixels: Floats32, person: Floats32, behind: Floats32) -> Floats32:
-    """Share [H, W] of the colour ``person`` in mixtures [H, W, 3] with ``behind``, unbounded; 1 where both are alike."""
+    """Share [H, W] of the colour ``person`` in mixtures with ``behind`` [H, W, 3], unbounded; 1 where both are one."""
     across = person - behind
     share = (((pixels - behind) * across).sum(-1) + 1e-6) / ((across**2).sum(-1) + 1e-6)
     return np.asarray(share, np.float32)
