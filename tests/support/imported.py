@@ -110,7 +110,7 @@ def assert_the_scene(capture: Capture, layout: Layout) -> None:
         if layout.distorted:
             straight, mask = _undistorted(name, frame.frame)
             assert mask_iou(images.mask > 0.5, mask) > UNDISTORTED_IOU
-            inside = mask & binary_erosion(images.mask > 0.99, np.ones((3, 3)))  # at the outline, neighbours' colours
+            inside = mask & binary_erosion(images.mask > 0.99, np.ones((3, 3)))  # a soft outline's are unmixed
             assert np.abs(images.image_srgb - straight / 255)[inside].mean() < UNDISTORTED_COLOUR
         else:
             assert ((images.mask > 0.5) == truth.mask).all()

@@ -98,6 +98,8 @@ def _without_background(linear: Floats32, coverage: Floats32) -> Floats32:
     The more there is, the more the person's colour nearby takes its place: what remains is the codec's noise.
     """
     least = cv2.erode(np.where(coverage > 0, coverage, np.float32(1)), np.ones((3, 3), np.uint8))  # of soft edges alone
+    if least.min() == 1:
+        return linear
     person, known = colour_around(linear, (coverage > 0) & (least > _COVERED), _REACH)
     behind, seen = colour_around(linear, coverage == 0, _REACH)
     taken = np.minimum(1 - share_of_person(linear, person, behind), 1 - least)
