@@ -9,6 +9,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -17,7 +18,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton, taken_along
-from rnd_runtime.posing.levels import NODES_SHARES, Surface, coarser, on_fewer_nodes
+from rnd_runtime.posing.levels import CULLED_LEVELS, Surface, coarser, on_fewer_nodes
 from rnd_runtime.posing.rest import RestPose, Unposed
 from rnd_runtime.posing.window import moment
 from rnd_runtime.shading.brdf import LARGEST_ALBEDO
@@ -98,23 +99,24 @@ class Avatar:
     def level(self, number: int) -> Avatar | None:
         """At a level of detail: 0 is itself, others are for fewer and fewer pixels; None beyond the coarsest.
 
-        The first have all Gaussians and a share of the nodes, where the file allows that; others have no more nodes.
-        They are made on first use, each in a hundredth of a second, and kept.
+        The first have all Gaussians and a share of the nodes, where the file allows that, and leave out the body's far
+        side; others have no more nodes. They are made on first use, each in a hundredth of a second, and kept.
         """
-        by_nodes = NODES_SHARES if self._levels[0]._networks.can_leave_out_nodes else ()
+        by_nodes = CULLED_LEVELS if self._levels[0]._networks.can_leave_out_nodes else ()
         while len(self._levels) <= number:
             whole, coarsest, made = self._levels[0], self._levels[-1], len(self._levels) - 1
-            level = whole._on_nodes(by_nodes[made]) if made < len(by_nodes) else coarsest._merged()
+            level = whole._culled(*by_nodes[made]) if made < len(by_nodes) else coarsest._merged()
             if level is None:
                 return None
             self._levels.append(level)
         return self._levels[number]
 
-    def _on_nodes(self, share: int) -> Avatar:
-        """On every ``share``-th node."""
+    def _culled(self, share: int, cull: float) -> Avatar:
+        """On every ``share``-th node, without what is below n·v = ``cull``."""
         assert self._rest is not None
         kept = np.arange(0, self.nodes, share)
-        level = shallow_copy(self, nodes=len(kept))
+        advised = cull if self.advice.cull is None else max(cull, self.advice.cull)
+        level = shallow_copy(self, nodes=len(kept), advice=msgspec.structs.replace(self.advice, cull=advised))
         level._networks, level._rest = self._networks.at_nodes(kept.tolist()), on_fewer_nodes(self._rest, kept)
         return level
 

@@ -103,10 +103,11 @@ class Extent(NamedTuple):
         return FineView(fine, self.factor, self.left, self.top, camera)
 
 
-def extent(camera: Camera, points: NDArray[np.floating[Any]]) -> Extent:
+def extent(camera: Camera, points: NDArray[np.floating[Any]], least: float) -> Extent:
     """The ``Extent`` of a body around ``points`` [N, 3] m in the frame of ``camera``'s ``world_to_camera``.
 
-    The factor is 1 where the body is large enough, not completely in front of the eye, or beside the image.
+    Its factor gives ``least`` pixels per metre or more; 1 where the body is not completely in front of the eye, or
+    beside the image.
     """
     depths = points @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
     nearest, farthest = float(depths.min(initial=np.inf)) - MARGIN, float(depths.max(initial=-np.inf)) + MARGIN
@@ -119,7 +120,7 @@ def extent(camera: Camera, points: NDArray[np.floating[Any]]) -> Extent:
     if not corner_depths.min() >= NEAR:
         return everywhere
     left, top, right, bottom = camera.box(pixels)
-    factor = min(math.ceil(MIN_PIXELS_PER_METRE * nearest / min(camera.K[0, 0], camera.K[1, 1])), MAX_FACTOR)
+    factor = min(math.ceil(least * nearest / min(camera.K[0, 0], camera.K[1, 1])), MAX_FACTOR)
     in_image = left < right and top < bottom
     return Extent(nearest, farthest, max(factor, 1) if in_image else 1, left, top, right, bottom)
 
@@ -129,7 +130,7 @@ def fine_view(camera: Camera, points: NDArray[np.floating[Any]]) -> FineView | N
 
     ``points`` are in the frame of ``camera``'s ``world_to_camera``.
     """
-    seen = extent(camera, points)
+    seen = extent(camera, points, MIN_PIXELS_PER_METRE)
     return None if seen.factor == 1 else seen.view(camera)
 
 

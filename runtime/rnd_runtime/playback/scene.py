@@ -32,7 +32,7 @@ from rnd_runtime.shading.shader import SHADOW_RESOLUTION, Shader, shadow_radii
 from rnd_runtime.shading.shadow import axes_towards, directional_visibility
 
 from .aov import aov_layers
-from .far import MARGIN, depth_groups, extent
+from .far import MARGIN, MIN_PIXELS_PER_METRE, Extent, depth_groups, extent
 from .frame import FrameRenderer, RenderedFrame, features_of, in_root_frame, splat
 from .framing import CameraPath, Framing, frame_motion
 
@@ -146,7 +146,7 @@ class SceneRenderer:
 
     def __init__(self, people: Sequence[Person], renderer: FrameRenderer, *, cull: float | None = None) -> None:
         self.people, self.renderer = people, renderer
-        self._culls = [person.avatar.advice.cull if cull is None else cull for person in people]
+        self._cull = cull
         if len(people) > 1 and not all(person.avatar.posed_outside for person in people):
             raise InputError("avatar of a scene", expected="a file of rnd-export", got="a graph that poses")
         self._arrays: dict[str, NDArray[Any]] = {}
@@ -205,9 +205,21 @@ class SceneRenderer:
         seconds["posing"], started = perf_counter() - started, perf_counter()
         shader, view = in_root_frame(frame, self.renderer.shader, camera)
         details = [person.avatar.spacing / body.avatar.spacing for person, body in zip(self.people, bodies)]
-        visible, features = self._shaded(shown, joints, shader, view, aovs, given, details)
+        culls = [body.avatar.advice.cull if self._cull is None else self._cull for body in bodies]
+        visible = [
+            visible_to(gaussians, view, None if cull is None or cull <= -1 else cull)
+            for gaussians, cull in zip(shown, culls)
+        ]
+        sunlit = self._sunlit(shown, joints, shader, visible, details)
+        features = [
+            features_of(gaussians, shader, view, seen, aovs=aovs, lit=True, given=own, sunlit=reached)
+            for gaussians, seen, own, reached in zip(shown, visible, given, sunlit)
+        ]
         seconds["shading"] = perf_counter() - started
-        raster = self._splatted(shown, joints, visible, features, view, "depth" in aovs)
+        # pixels finer than the distances between its Gaussians would show no more of a body
+        least = [min(1 / body.avatar.spacing, MIN_PIXELS_PER_METRE) for body in bodies]
+        extents = [extent(view, points, size) for points, size in zip(joints, least)]
+        raster = self._splatted(shown, extents, visible, features, view, "depth" in aovs)
         for stage, spent in raster.seconds.items():
             seconds[stage] = seconds.get(stage, 0.0) + spent
         layers = aov_layers(aovs, raster, 3, given[0])
@@ -223,28 +235,6 @@ class SceneRenderer:
         return RenderedFrame(
             radiance, raster.alpha, layers, seconds, ground=ground, srgb_on_black=image_srgb, tone=self.renderer.tone
         )
-
-    def _shaded(
-        self,
-        posed: Sequence[Gaussians],
-        joints: Sequence[NDArray[np.float64]],
-        shader: Shader,
-        camera: Camera,
-        aovs: Sequence[str],
-        given: Sequence[Mapping[str, Floats32]],
-        details: Sequence[float],
-    ) -> tuple[list[NDArray[np.bool_]], list[Floats32]]:
-        """Who is visible [N] and features [N, C], for each body; ``details`` are as of ``_sunlit``."""
-        visible = [
-            visible_to(gaussians, camera, None if cull is None or cull <= -1 else cull)
-            for gaussians, cull in zip(posed, self._culls)
-        ]
-        sunlit = self._sunlit(posed, joints, shader, visible, details)
-        features = [
-            features_of(gaussians, shader, camera, seen, aovs=aovs, lit=True, given=own, sunlit=reached)
-            for gaussians, seen, own, reached in zip(posed, visible, given, sunlit)
-        ]
-        return visible, features
 
     def _sunlit(
         self,
@@ -289,7 +279,7 @@ class SceneRenderer:
     def _splatted(
         self,
         posed: Sequence[Gaussians],
-        joints: Sequence[NDArray[np.float64]],
+        extents: Sequence[Extent],
         visible: Sequence[NDArray[np.bool_]],
         features: Sequence[Floats32],
         camera: Camera,
@@ -299,7 +289,7 @@ class SceneRenderer:
         height, width = camera.height, camera.width
         seconds: dict[str, float] = {}
         result: Raster | None = None
-        for bodies, part in depth_groups([extent(camera, points) for points in joints]):
+        for bodies, part in depth_groups(extents):
             fine = part.view(camera) if part.factor > 1 else None
             arrays = [[getattr(posed[i], name) for i in bodies] for name in ("means", "covariances", "opacities")]
             means, covariances, opacities, attributes, seen = (

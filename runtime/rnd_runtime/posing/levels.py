@@ -19,15 +19,16 @@ from .rest import RestPose
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
-KEPT = 0.98
+KEPT = 0.985
 """share of the Gaussians that the next coarser level keeps"""
-NODES_SHARES = (4, 16)
-"""nodes for each one that the first levels keep: 0.6 and 0.9/255 of difference at any size"""
+CULLED_LEVELS = ((4, -0.6), (16, -0.5), (32, -0.4))
+"""of the first levels: nodes for each one that is kept, and the n·v below which Gaussians are left out; each 0.9 to
+1/255 from the one before, at any size"""
 WINDOW = 96  # Gaussians along a space-filling curve among which a partner is searched
 MIN_COSINE = 0.6  # of the normals of a pair
 REACH = 2.5  # median distances to the nearest neighbour on the same side that a pair may be apart
 COLOUR_WEIGHT = 50.0  # of squared differences of albedo, against squared distances
-GROWTH = 0.5  # exponent: when 42 % are left, a body has lost 1 % of its coverage at 0 and gained 2 % at 0.8
+GROWTH = 0.5  # exponent: when 40 % are left, a body has lost 1 % of its coverage at 0 and gained 1 % at 0.5
 _BITS = 10  # of a coordinate on the curve
 _NOWHERE = 1e3  # m
 _ROWS = 1024  # Gaussians whose distances to all nodes are kept at once

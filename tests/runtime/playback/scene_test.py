@@ -9,9 +9,10 @@ import pytest
 
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.ground.shadow import Plane
-from rnd_runtime.playback.far import Extent, depth_groups
+from rnd_runtime.playback.far import MIN_PIXELS_PER_METRE, Extent, depth_groups
 from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.playback.scene import Person, SceneRenderer, chosen_levels, frame_people, greatest_sizes, place_at
+from rnd_runtime.posing.levels import CULLED_LEVELS
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.raster.outline import sharpened
 from rnd_runtime.shading.light import Light, texel_directions
@@ -156,9 +157,13 @@ def test_levels_have_fewer_and_fewer_nodes_and_gaussians(avatar):
     sizes = greatest_sizes(avatar)
     levels = [avatar.level(number) for number in range(len(sizes))]
     assert avatar.level(len(sizes)) is None
-    nodes = [level.nodes for level in levels]
-    assert nodes == [avatar.nodes, -(-avatar.nodes // 4), *[-(-avatar.nodes // 16)] * (len(levels) - 2)]
-    assert levels[2].gaussians == avatar.gaussians and (np.diff([level.gaussians for level in levels[2:]]) < 0).all()
+    nodes, culls = ([getattr(level, name) for level in levels[1:]] for name in ("nodes", "advice"))
+    first = [-(-avatar.nodes // share) for share, _ in CULLED_LEVELS]
+    assert nodes == first + [first[-1]] * (len(nodes) - len(first))
+    assert [advice.cull for advice in culls[: len(first)]] == [cull for _, cull in CULLED_LEVELS]
+    assert culls[-1] == culls[len(first) - 1] and avatar.advice.cull is None
+    merged = levels[len(first) :]
+    assert merged[0].gaussians == avatar.gaussians and (np.diff([level.gaussians for level in merged]) < 0).all()
     assert sizes[0] == np.inf and (np.diff(sizes) < 0).all()
 
 
@@ -189,6 +194,33 @@ def test_far_people_get_coarser_levels_and_parts_of_a_run_the_same(avatar, motio
     difference = np.sqrt(np.mean((full.srgb.astype(float) - coarse.srgb) ** 2))
     assert 0 < difference < 1
     np.testing.assert_allclose(coarse.alpha.sum(), full.alpha.sum(), rtol=0.04)
+
+
+def test_a_level_leaves_out_the_far_side_unless_all_is_asked_for(avatar, motion, sky):
+    camera = Camera.look_at([0, 1, 4], [0, 1, 0], width=200, height=200, fov_y=0.8)
+    with FrameRenderer(avatar, sky) as renderer:
+
+        def drawn(cull):
+            scene = SceneRenderer([Person(avatar, motion)], renderer, cull=cull)
+            return scene.draw(scene.encode(TIME, [len(CULLED_LEVELS)]), camera).radiance
+
+        advised, same, everything = (drawn(cull) for cull in (None, CULLED_LEVELS[-1][1], -1.0))
+    np.testing.assert_array_equal(advised, same)
+    assert np.abs(advised - everything).max() > 0.01
+
+
+def test_a_merged_level_is_drawn_on_the_images_own_grid(avatar, motion):
+    """As its Gaussians are a pixel apart, finer pixels would show no more: nothing jumps where levels are merged."""
+    light = Light(np.ones((16, 32, 3), np.float32))
+    sizes = greatest_sizes(avatar)
+    number = int(np.flatnonzero(sizes < 0.8 * MIN_PIXELS_PER_METRE)[0])
+    size = sizes[number]
+    camera = Camera.look_at([0, 1, 10], [0, 1, 0], width=240, height=240, fov_y=2 * np.arctan(120 / (10 * size)))
+    with FrameRenderer(avatar, light, shade="ao") as renderer:
+        scene = SceneRenderer([Person(avatar, motion)], renderer)
+        finer, merged = (scene.draw(scene.encode(TIME, [level]), camera) for level in (number - 1, number))
+    assert "compositing" not in merged.stage_seconds
+    assert np.sqrt(np.mean((finer.srgb.astype(float) - merged.srgb) ** 2)) < 1
 
 
 def test_everybody_shades_the_ground_and_no_sun_is_hidden_twice(avatar, motion):

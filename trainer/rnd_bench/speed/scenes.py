@@ -40,12 +40,11 @@ def bench_scenes(
     limits, and each crowd and its stages against these limits."""
     avatar = Avatar.load(avatar_file)
     motion, light = load_motion(motion_file, avatar.skeleton), load_light(light_file)
-    levels = [avatar]
-    while (level := avatar.level(len(levels))) is not None:
-        levels.append(level)
-        on_row("switches", _switch_row(levels, motion, light))
+    scene = SceneRenderer([Person(avatar, motion)], FrameRenderer(avatar, light))
+    for number in range(1, len(greatest_sizes(avatar))):
+        on_row("switches", _switch_row(scene, number))
     for pixels in HEIGHTS:
-        on_row("heights", _height_row(avatar, pixels, motion, light, repeats))
+        on_row("heights", _height_row(scene, pixels, repeats))
     limits = machine_limits()
     on_row("limits", limits)
     for count, height in CROWDS.items():
@@ -70,10 +69,9 @@ def _at(avatar: Avatar, number: int) -> Avatar:
     return level
 
 
-def _frames(avatar: Avatar, pixels: float, motion: Motion, light: Light) -> list[RenderedFrame]:
-    """In every one of ``VIEWS``."""
-    renderer = FrameRenderer(avatar, light)
-    return [renderer.render(motion, time, camera_of(pixels, azimuth)) for time, azimuth in VIEWS]
+def _frames(scene: SceneRenderer, level: int, pixels: float) -> list[RenderedFrame]:
+    """Of a lone person in every one of ``VIEWS``."""
+    return [scene.draw(scene.encode(time, [level]), camera_of(pixels, azimuth)) for time, azimuth in VIEWS]
 
 
 def _difference(ours: Sequence[RenderedFrame], others: Sequence[RenderedFrame]) -> float:
@@ -82,15 +80,17 @@ def _difference(ours: Sequence[RenderedFrame], others: Sequence[RenderedFrame]) 
     return float(np.sqrt(np.mean(squares)))
 
 
-def _switch_row(levels: Sequence[Avatar], motion: Motion, light: Light) -> dict[str, Any]:
-    """The last of an avatar's levels at the greatest height where it is taken, against the finer one and the whole."""
-    avatar, finer, level = levels[0], levels[-2], levels[-1]
-    pixels = float(greatest_sizes(avatar)[len(levels) - 1]) * HEIGHT
-    ours, others, whole = (_frames(each, pixels, motion, light) for each in (level, finer, avatar))
+def _switch_row(scene: SceneRenderer, number: int) -> dict[str, Any]:
+    """A level at the greatest height where it is taken, against the finer one and the whole."""
+    avatar = scene.people[0].avatar
+    level = _at(avatar, number)
+    pixels = float(greatest_sizes(avatar)[number]) * HEIGHT
+    ours, others, whole = (_frames(scene, each, pixels) for each in (number, number - 1, 0))
     coverage = sum(float(frame.alpha.sum()) for frame in ours) / sum(float(frame.alpha.sum()) for frame in whole)
     return {
         "gaussians": level.gaussians,
         "nodes": level.nodes,
+        "cull": level.advice.cull,
         "of": avatar.gaussians,
         "pixels": pixels,
         "rms_to_finer": _difference(ours, others),
@@ -99,17 +99,17 @@ def _switch_row(levels: Sequence[Avatar], motion: Motion, light: Light) -> dict[
     }
 
 
-def _height_row(avatar: Avatar, pixels: int, motion: Motion, light: Light, repeats: int) -> dict[str, Any]:
+def _height_row(scene: SceneRenderer, pixels: int, repeats: int) -> dict[str, Any]:
     """The level that a person of ``pixels`` height gets, and the whole avatar."""
-    level = _at(avatar, int(chosen_levels(np.array([pixels / HEIGHT]), greatest_sizes(avatar))[0]))
-    ours, whole = (_frames(each, pixels, motion, light) for each in (level, avatar))
-    row = {"pixels": pixels, "gaussians": level.gaussians, "rms_to_whole": _difference(ours, whole)}
-    for name, each in {"": level, "whole_": avatar}.items():
-        renderer = FrameRenderer(each, light)
+    avatar = scene.people[0].avatar
+    number = int(chosen_levels(np.array([pixels / HEIGHT]), greatest_sizes(avatar))[0])
+    ours, whole = (_frames(scene, each, pixels) for each in (number, 0))
+    row = {"pixels": pixels, "gaussians": _at(avatar, number).gaussians, "rms_to_whole": _difference(ours, whole)}
+    for name, level in {"": number, "whole_": 0}.items():
 
-        def draw(number: int, renderer: FrameRenderer = renderer) -> None:
-            renderer.turn(STEP_YAW * number)
-            renderer.render(motion, STEP_S * number, camera_of(pixels, 0.3))
+        def draw(frame: int, level: int = level) -> None:
+            scene.renderer.turn(STEP_YAW * frame)
+            scene.draw(scene.encode(STEP_S * frame, [level]), camera_of(pixels, 0.3))
 
         row |= {name + key: value for key, value in _timed(draw, repeats).items()}
     return row
