@@ -129,7 +129,7 @@ def chosen_levels(pixels_per_metre: Floats, greatest: Floats) -> NDArray[np.intp
     """
     sizes = pixels_per_metre / greatest[1:, None]  # [L − 1, F]
     coarsest, lagging = ((sizes * factor <= 1).sum(axis=0) for factor in (1.0, HYSTERESIS))
-    levels: NDArray[np.intp] = lagging.copy()
+    levels: NDArray[np.intp] = coarsest.copy()
     for frame in range(1, len(levels)):
         levels[frame] = np.clip(levels[frame - 1], lagging[frame], coarsest[frame])
     return levels
