@@ -139,7 +139,7 @@ class Scenes:
     """light probe"""
     json: OptionalFile = None
     """write the rows here"""
-    repeats: Count = 30
+    repeats: Count = 60
     """timed frames of each"""
     threads: OptionalCount = None
     """by default two, where there are two cores"""

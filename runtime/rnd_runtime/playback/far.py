@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import permutations, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +27,7 @@ MAX_FACTOR = 64
 """fine pixels along a pixel's side; a person of 3 pixels needs them"""
 MARGIN = 0.35
 """m around the joints that hair, hands and clothes stay within"""
+_UPPER = np.array([*product([False, True], repeat=3)])  # sides of a box that meet in each of its corners
 
 
 @dataclass(frozen=True)
@@ -114,9 +115,7 @@ def extent(camera: Camera, points: NDArray[np.floating[Any]], least: float) -> E
     everywhere = Extent(nearest, farthest, 1, 0, 0, camera.width, camera.height)
     if not NEAR <= nearest < np.inf:  # NaN too
         return everywhere
-    low, high = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
-    corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
-    pixels, corner_depths = camera.project(corners)
+    pixels, corner_depths = camera.project(np.where(_UPPER, points.max(axis=0) + MARGIN, points.min(axis=0) - MARGIN))
     if not corner_depths.min() >= NEAR:
         return everywhere
     left, top, right, bottom = camera.box(pixels)

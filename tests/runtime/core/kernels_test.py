@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -33,6 +34,20 @@ prepare_process()
 cold = kernels_are_cold()
 from rnd_runtime.raster.kernel import outer
 print(outer(1), cold, kernels_are_cold())
+"""
+
+FRAMES = """
+import resource
+import numpy as np
+from rnd_runtime.core.kernels import prepare_process
+prepare_process()
+def frame():
+    return [np.ones(100_000, np.float32) for _ in range(100)]
+frame(), frame()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(10):
+    frame()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
@@ -93,3 +108,9 @@ def test_only_the_rasterisers_kernels_count(tmp_path, monkeypatch):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "blend.draw-7.py312.nbi").touch()
         assert kernels_are_cold() == cold
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+def test_what_a_frame_frees_is_kept_for_the_next():
+    done = subprocess.run([sys.executable, "-c", FRAMES], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 1000  # of 100 000 pages

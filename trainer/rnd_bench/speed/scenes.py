@@ -105,11 +105,12 @@ def _height_row(scene: SceneRenderer, pixels: int, repeats: int) -> dict[str, An
     number = int(chosen_levels(np.array([pixels / HEIGHT]), greatest_sizes(avatar))[0])
     ours, whole = (_frames(scene, each, pixels) for each in (number, 0))
     row = {"pixels": pixels, "gaussians": _at(avatar, number).gaussians, "rms_to_whole": _difference(ours, whole)}
+    camera = camera_of(pixels, VIEWS[0][1])
     for name, level in {"": number, "whole_": 0}.items():
 
         def draw(frame: int, level: int = level) -> None:
             scene.renderer.turn(STEP_YAW * frame)
-            scene.draw(scene.encode(STEP_S * frame, [level]), camera_of(pixels, 0.3))
+            scene.draw(scene.encode(STEP_S * frame, [level]), camera)
 
         row |= {name + key: value for key, value in _timed(draw, repeats).items()}
     return row
