@@ -250,5 +250,5 @@ def test_people_are_trained_scored_and_nothing_is_done_twice(tiny_capture, tmp_p
     sheet = read_image(tmp_path / "people.png")
     assert sheet.shape == (CAPTION + side, len(WORDS) * side, 3)
     truth = capture.load_frame(relit[len(relit) // 2]).image_srgb
-    np.testing.assert_allclose(sheet[CAPTION:, 4 * side : 5 * side] / 255, truth, atol=1 / 254)
+    np.testing.assert_allclose(sheet[CAPTION:, 6 * side : 7 * side] / 255, truth, atol=1 / 254)
     assert again["rows"] == first["rows"] and (first["looks"], again["looks"]) == (1, 2)

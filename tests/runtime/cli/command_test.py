@@ -246,9 +246,14 @@ sys.exit(run_command("rnd-x", main))
 @pytest.mark.parametrize("ignored", [False, True])
 def test_a_program_that_is_ended_takes_its_half_files_away(tmp_path, ignored, ending):
     """SIGTERM and SIGHUP, also where a shell that put the command into the background has switched Ctrl-C off."""
-    ignore = (lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)) if ignored else None
+
+    def begin() -> None:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under nohup
+        if ignored:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+
     command = [sys.executable, "-c", _COMMAND, str(tmp_path / "a.txt"), ending]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=25, preexec_fn=ignore)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=25, preexec_fn=begin)
     number = getattr(signal, ending)
     assert (done.returncode, done.stderr) == (128 + number, "rnd-x: interrupted\n")
     assert not list(tmp_path.iterdir())

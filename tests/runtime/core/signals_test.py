@@ -30,17 +30,20 @@ _SHOWS_HANDLERS = pytest.mark.skipif(not Path("/proc/self/status").exists(), rea
 ENDINGS = [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)]
 
 
-def _heed() -> None:
-    """A runner in the background passes on that Ctrl-C is ignored."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+@pytest.fixture(autouse=True)
+def heeded():
+    """A runner in the background passes on that Ctrl-C is ignored, and ``nohup`` that hang-ups are."""
+    handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 def _started(body: str, *words: object) -> subprocess.Popen[str]:
     code = HEAD + body + "\nsys.exit(run_command('rnd-x', main))\n"
     command = [sys.executable, "-c", code, *map(str, words)]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=_heed, cwd="/"
-    )
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd="/")
     assert process.stdout and process.stdout.readline() == "ready\n"
     return process
 
@@ -183,11 +186,7 @@ def _interrupted(command: list[object], out: Path, after: float, number: int) ->
     """Start, wait, send the signal, and check the end; a process that has ended before is started again, sooner."""
     while True:
         process = subprocess.Popen(
-            [str(word) for word in command],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            preexec_fn=_heed,
+            [str(word) for word in command], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         )
         _wait_for_handlers(process.pid)
         time.sleep(after)

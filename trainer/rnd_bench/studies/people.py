@@ -155,7 +155,8 @@ def write_sheet(sizes: PeopleSizes, folder: Path, variant: StudyRow, file: Path)
     people = []
     for subject in sizes.seeds_of_people:
         trained = folder_of(_runs(sizes, folder, subject), variant, 0) / "avatar.ckpt"
-        people.append((load_checkpoint(trained), load_capture(folder / f"subject{subject}")))
+        out = folder / f"subject{subject}"
+        people.append((load_checkpoint(trained), load_capture(out), prepare(sizes.recipe(subject), out)))
     write_people_sheet(file, people)
 
 

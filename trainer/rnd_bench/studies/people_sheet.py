@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.capture.capture import Capture
-from rnd_runtime.capture.format import Split
+from rnd_runtime.capture.format import Frame, Split
+from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.images import linear_to_srgb, to_bytes, write_image
 from rnd_runtime.shading.light import REC709_LUMINANCE, Light
+from rnd_stage.film.film import TRUTH_SAMPLES, Production
+from rnd_stage.people.dressing import Wearer
+from rnd_stage.render import RenderSet
 from rnd_trainer.evaluation.evaluate import Evaluator
 from rnd_trainer.evaluation.preview import captions
 from rnd_trainer.model.checkpoint import Checkpoint
@@ -21,18 +27,23 @@ Bytes = NDArray[np.uint8]
 
 SHOWN: tuple[Split, ...] = ("novel_view", "relight")
 GREY = 0.3  # mean luminance at which both lights are shown
-WORDS = ("novel view", "ours", "albedo", "ours", "another light", "ours", "its light", "learned")
+WORDS = ("novel view", "ours", "albedo", "ours", "palm", "ours", "another light", "ours", "its light", "learned")
+PALM = (0.08, 0, 0), (0, -1, 0.3), 0.48
+"""the left one in the T-pose: its middle from the wrist, m; direction to the camera, and its distance, m"""
 
 
-def write_people_sheet(path: Path, people: Sequence[tuple[Checkpoint, Capture]]) -> None:
-    """Write a row for each person: truth and ours by turns, the middle frame of each of ``SHOWN``, then the lights."""
+def write_people_sheet(path: Path, people: Sequence[tuple[Checkpoint, Capture, Production]]) -> None:
+    """Write a row for each person: truth and ours by turns, the middle frame of each of ``SHOWN``, then the lights.
+
+    ``Production`` is of the capture.
+    """
     rows = [_row(*person) for person in people]
     tile = rows[0].shape[0]
     write_image(path, np.concatenate([captions(WORDS, tile), *rows]))
 
 
-def _row(checkpoint: Checkpoint, capture: Capture) -> Bytes:
-    """[H, 8·H, 3] in the order of ``WORDS``, of a capture of the light stage: square images, true albedo and light."""
+def _row(checkpoint: Checkpoint, capture: Capture, production: Production) -> Bytes:
+    """[H, 10·H, 3] in the order of ``WORDS``, of a capture of the light stage: square images, true albedo and light."""
     evaluator, tiles = Evaluator(checkpoint, capture), []
     for split in SHOWN:
         frames = capture.split(split)
@@ -42,11 +53,30 @@ def _row(checkpoint: Checkpoint, capture: Capture) -> Bytes:
         if split == SHOWN[0]:
             assert truth.albedo_srgb is not None
             tiles += [truth.albedo_srgb, linear_to_srgb(ours.albedo.numpy())]
+            tiles += _palms(checkpoint, capture, production, frame, len(truth.image_srgb))
     name = capture.split("train")[0].light
     assert name is not None
     learned = Light(checkpoint.probe_of(name).numpy())
     tiles += [_map(light, len(tiles[0])) for light in (capture.load_light(name), learned)]
     return np.concatenate([to_bytes(tile) for tile in tiles], axis=1)
+
+
+def _palms(
+    checkpoint: Checkpoint, capture: Capture, production: Production, frame: Frame, side: int
+) -> list[NDArray[np.floating]]:
+    """True and learned albedo [side, side, 3] sRGB of the left palm in ``frame``."""
+    offset, towards, distance = PALM
+    skeleton, motion, at = capture.body.skeleton, capture.motion, frame.frame
+    moved = skeleton.joint_transforms(motion.rotations[at], motion.translations[at])
+    wrist = moved[skeleton.names.index("left_wrist")]
+    target = wrist[:3, 3] + wrist[:3, :3] @ offset
+    eye = target + distance * wrist[:3, :3] @ towards / np.linalg.norm(towards)
+    camera = Camera.look_at(eye, target, width=side, height=side, fov_y=0.5)
+    seen = replace(capture, cameras={**capture.cameras, "palm": camera})
+    ours = Evaluator(checkpoint, seen).render(msgspec.structs.replace(frame, camera="palm"))
+    surface = Wearer(production.dressed, production.motion, [at]).surface(at)
+    truth = RenderSet(surface).truth(camera, samples=TRUTH_SAMPLES, seed=0)
+    return [linear_to_srgb(np.clip(albedo, 0, 1)) for albedo in (truth.albedo, ours.albedo.numpy())]
 
 
 def _map(light: Light, side: int) -> NDArray[np.float32]:
