@@ -28,7 +28,7 @@ from support.paths import ASSETS
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
 
-SIZE = 192
+SIZE = 240  # so large that rnd-play merges no Gaussians
 FRAME = 20
 MESSAGE = "document.getElementById('message').textContent"
 OUTCOME = """Promise.race([
