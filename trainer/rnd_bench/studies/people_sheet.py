@@ -22,14 +22,14 @@ from rnd_stage.render import RenderSet
 from rnd_trainer.evaluation.evaluate import Evaluator
 from rnd_trainer.evaluation.preview import captions
 from rnd_trainer.model.checkpoint import Checkpoint
+from rnd_viewer.report.renders import CLOSE_UPS
 
 Bytes = NDArray[np.uint8]
 
 SHOWN: tuple[Split, ...] = ("novel_view", "relight")
 GREY = 0.3  # mean luminance at which both lights are shown
 WORDS = ("novel view", "ours", "albedo", "ours", "palm", "ours", "another light", "ours", "its light", "learned")
-PALM = (0.08, 0, 0), (0, -1, 0.3), 0.48
-"""the left one in the T-pose: its middle from the wrist, m; direction to the camera, and its distance, m"""
+PALM_DISTANCE, PALM_FOV = 0.48, 0.5  # m, rad
 
 
 def write_people_sheet(path: Path, people: Sequence[tuple[Checkpoint, Capture, Production]]) -> None:
@@ -65,13 +65,13 @@ def _palms(
     checkpoint: Checkpoint, capture: Capture, production: Production, frame: Frame, side: int
 ) -> list[NDArray[np.floating]]:
     """True and learned albedo [side, side, 3] sRGB of the left palm in ``frame``."""
-    offset, towards, distance = PALM
+    joint, offset, towards = CLOSE_UPS["left palm"]
     skeleton, motion, at = capture.body.skeleton, capture.motion, frame.frame
     moved = skeleton.joint_transforms(motion.rotations[at], motion.translations[at])
-    wrist = moved[skeleton.names.index("left_wrist")]
+    wrist = moved[skeleton.names.index(joint)]
     target = wrist[:3, 3] + wrist[:3, :3] @ offset
-    eye = target + distance * wrist[:3, :3] @ towards / np.linalg.norm(towards)
-    camera = Camera.look_at(eye, target, width=side, height=side, fov_y=0.5)
+    eye = target + PALM_DISTANCE * wrist[:3, :3] @ towards / np.linalg.norm(towards)
+    camera = Camera.look_at(eye, target, width=side, height=side, fov_y=PALM_FOV)
     seen = replace(capture, cameras={**capture.cameras, "palm": camera})
     ours = Evaluator(checkpoint, seen).render(msgspec.structs.replace(frame, camera="palm"))
     surface = Wearer(production.dressed, production.motion, [at]).surface(at)
