@@ -24,12 +24,12 @@ KEPT = 0.985
 CULLED_LEVELS = ((4, -0.6), (16, -0.5), (32, -0.4))
 """of the first levels: nodes for each one that is kept, and the n·v below which Gaussians are left out; each 0.9 to
 1/255 from the one before, at any size"""
-WINDOW = 96  # Gaussians along a space-filling curve among which a partner is searched
+PARTNER_WINDOW = 96  # Gaussians along a space-filling curve among which a partner is searched
 MIN_COSINE = 0.6  # of the normals of a pair
-REACH = 2.5  # median distances to the nearest neighbour on the same side that a pair may be apart
+PARTNER_REACH = 2.5  # median distances to the nearest neighbour on the same side that a pair may be apart
 COLOUR_WEIGHT = 50.0  # of squared differences of albedo, against squared distances
 GROWTH = 0.5  # exponent: when 40 % are left, a body has lost 1 % of its coverage at 0 and gained 1 % at 0.5
-_BITS = 10  # of a coordinate on the curve
+_CURVE_BITS = 10  # of a coordinate on the curve
 _NOWHERE = 1e3  # m
 _ROWS = 1024  # Gaussians whose distances to all nodes are kept at once
 
@@ -138,9 +138,9 @@ def _pairs(points: Floats, normals: Floats, albedo: Floats) -> tuple[NDArray[np.
 def _z_curve(points: Floats) -> NDArray[np.int64]:
     """Order [N] of ``points`` along a Z-curve (Morton 1966)."""
     low, size = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-9)
-    cells = ((points - low) * ((2**_BITS - 1) / size)).astype(np.int64)
+    cells = ((points - low) * ((2**_CURVE_BITS - 1) / size)).astype(np.int64)
     codes = np.zeros(len(points), np.int64)
-    for bit in range(_BITS):
+    for bit in range(_CURVE_BITS):
         for axis in range(3):
             codes |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
     return np.argsort(codes, kind="stable")
@@ -152,16 +152,16 @@ def _match(points, normals, albedo, partner, cost):  # type: ignore[no-untyped-d
     count = len(points)
     nearest = np.full(count, np.inf)
     for i in range(count):
-        for j in range(i + 1, min(i + WINDOW + 1, count)):
+        for j in range(i + 1, min(i + PARTNER_WINDOW + 1, count)):
             if _cosine(normals[i], normals[j]) > MIN_COSINE:
                 square = _squared(points[i], points[j])
                 nearest[i], nearest[j] = min(nearest[i], square), min(nearest[j], square)
-    reach = REACH * REACH * np.median(nearest)
+    reach = PARTNER_REACH * PARTNER_REACH * np.median(nearest)
     for i in range(count):
         if partner[i] >= 0:
             continue
         best, chosen = reach, -1
-        for j in range(i + 1, min(i + WINDOW + 1, count)):
+        for j in range(i + 1, min(i + PARTNER_WINDOW + 1, count)):
             square = _squared(points[i], points[j])
             if partner[j] >= 0 or square >= best:
                 continue

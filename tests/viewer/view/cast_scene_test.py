@@ -54,6 +54,9 @@ def test_a_scene_of_one_is_the_avatar(tmp_path):
         {"output": "normal"},
         {"output": "albedo", "gaussians": 5000},
         {"gaussians": 3000, "shade": "table", "time": 0.0},
+        {"distance": 9.0},  # of merged Gaussians
+        {"distance": 9.0, "output": "albedo", "time": 0.3},
+        {},
     ):
         ours, theirs = (scene.render(replace(state, **changes)) for scene in (cast, alone))
         error = np.abs(ours.srgb.astype(int) - theirs.srgb)

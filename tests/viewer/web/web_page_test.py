@@ -274,7 +274,11 @@ def _is_refusal(page: Page) -> bool:
 
 def _frame(page: Page, **changes: Any) -> np.ndarray:
     """[H, W, 3] of the state with ``changes``."""
-    page.run(f"Object.assign(rnd.state, {json.dumps(changes)}); rnd.frame().then(() => 1)")
+    page.run(f"""(async () => {{
+        Object.assign(rnd.state, {json.dumps(changes)});
+        const shown = async () => (await rnd.frame()).gaussians;
+        for (let before = null, now = await shown(); now !== before; [before, now] = [now, await shown()]);
+    }})()""")  # far bodies have fewer and fewer Gaussians, as levels of detail are made
     url = page.run("document.getElementById('frame').toDataURL()")
     return np.asarray(Image.open(BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB"))
 
@@ -320,6 +324,25 @@ def test_the_pixels_are_rnd_plays(loaded, site, tmp_path):
     _assert_close(got, expected)
     # were the light not turned, or the frame its neighbour, hundreds of pixels would be off
     assert (np.abs(_frame(loaded, yaw=0).astype(int) - expected).max(-1) > TOLERANCE).sum() > 1000
+
+
+def test_a_far_body_has_as_few_gaussians_as_in_rnd_play(loaded, site, tmp_path):
+    side, avatar = 96, Avatar.load(site / "avatar.onnx")
+    straight = {"yaw": 0, "exposure": 0, "shade": "table+sun", "output": "lit", "tone": "srgb", "ground": False}
+    state = {"width": side, "height": side, "time": FRAME / 30, "light": 1, "background": "hdr", "distance": 7.0}
+    got = _frame(loaded, **straight, **state)
+    fewer, whole, again = loaded.run("""(async () => {
+        const count = async (changes) => (Object.assign(rnd.state, changes), (await rnd.frame()).gaussians);
+        return [await count({}), await count({ distance: 0.9 }), await count({ distance: 7 })];
+    })()""")
+    assert fewer == again < 0.5 * whole and whole == avatar.gaussians
+    camera = msgspec.convert(loaded.run("rnd.state"), ViewState).camera()
+    path = {"width": side, "height": side, "K": camera.K.tolist(), "world_to_camera": camera.world_to_camera.tolist()}
+    (tmp_path / "camera.json").write_text(json.dumps(path))
+    inputs = [str(site / "avatar.onnx"), "--motion", str(site / "walk.npz"), "--hdr", str(site / "sky.exr")]
+    options = ["--camera", str(tmp_path / "camera.json"), "--frames", f"{FRAME}:{FRAME + 1}", "--raster", "cpu"]
+    assert play([*inputs, *options, "--format", "png", "--background", "hdr", "--out", str(tmp_path / "out")]) == 0
+    _assert_close(got, read_image(tmp_path / f"out/frames/{FRAME:06d}.png"))
 
 
 def test_every_state_has_rnd_views_pixels(loaded, site):

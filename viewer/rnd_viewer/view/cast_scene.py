@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from concurrent.futures import Future
-from functools import cached_property, partial
-from time import perf_counter
+from functools import cached_property
 
 import numpy as np
 
-from rnd_runtime.avatar.avatar import Encoded
 from rnd_runtime.avatar.networks import Networks
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.ground.shadow import Plane
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.frame import RenderedFrame
 from rnd_runtime.playback.framing import Framing
-from rnd_runtime.playback.scene import SceneRenderer, frame_people, ground_under
+from rnd_runtime.playback.scene import frame_people, ground_under
 from rnd_viewer.inputs.cast import load_people
 from rnd_viewer.inputs.scenes import read_scene
 
 from .options import ViewOptions
-from .scene import Floats32, Scene, aovs_of, projected
+from .people import ViewedPeople
+from .scene import Floats32, Scene, projected
 from .state import ViewState
 
 
@@ -33,8 +32,7 @@ class CastScene(Scene):
 
     def __init__(self, options: ViewOptions) -> None:
         super().__init__(options)
-        self._all = SceneRenderer(self.people, self.renderer)
-        self._encoded: tuple[float, list[int], list[Encoded]] | None = None
+        self._all = ViewedPeople(self.people, self.renderer)
 
     def _load(self, options: ViewOptions, ahead: Future[Networks] | None) -> None:
         self.people = load_people(read_scene(options.avatar), options.reading, options.albedo_gain, options.threads)
@@ -75,23 +73,10 @@ class CastScene(Scene):
     def _draw(
         self, state: ViewState, camera: Camera, motion: Motion, time_s: float, grounded: bool, seconds: dict[str, float]
     ) -> RenderedFrame:
-        bodies = self._encode(time_s, camera, seconds)
-        self.renderer.ground = self._plane if grounded else None
-        light = self._turned_ground_light(state) if grounded else None
-        change = partial(self._changed, state)
-        return self._all.draw(bodies, camera, aovs=aovs_of(state), srgb=False, change=change, ground_light=light)
-
-    def _encode(self, time_s: float, camera: Camera, seconds: dict[str, float]) -> list[Encoded]:
-        """At the levels of detail of ``camera``; cached while these and the time stay."""
-        levels = self._all.levels(1, self.motion.fps, lambda frame, at: camera, start=time_s)[0].tolist()
-        if self._encoded is None or self._encoded[:2] != (time_s, levels):
-            started = perf_counter()
-            self._encoded = time_s, levels, self._all.encode(time_s, levels)
-            seconds["encoders"] = perf_counter() - started
-        return self._encoded[2]
+        return self._draw_people(self._all, state, camera, time_s, self._plane if grounded else None, seconds)
 
     def _joints(self, motion: Motion, time_s: float, camera: Camera) -> Floats32:
-        bodies = self._encode(time_s, camera, {})
+        bodies = self._all.bodies(time_s, camera, {})
         inside = [body.avatar.joints(body) for body in bodies]
         world = [points @ body.root[:3, :3].T + body.root[:3, 3] for points, body in zip(inside, bodies)]
         return projected(np.concatenate(world), camera)

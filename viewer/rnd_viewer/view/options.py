@@ -85,3 +85,19 @@ class ViewOptions:
         """Of a frame, px."""
         width, height = self.size or (512, None)
         return width, height or width
+
+
+def probes(paths: tuple[Path, ...]) -> list[Path]:
+    """The light probes among ``paths`` and in their folders."""
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(file for file in path.iterdir() if file.suffix.lower() in (".exr", ".hdr"))
+            if not inside:
+                raise InputError("--hdr", expected="light probes, .exr or .hdr", got="none", file=path)
+            files += inside
+        elif path.is_file():
+            files.append(path)
+        else:
+            raise InputError("light probe not found", file=path)
+    return files

@@ -20,13 +20,14 @@ from rnd_runtime.core.camera import Camera, Floats
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.ground.shadow import GroundLight
+from rnd_runtime.ground.shadow import GroundLight, Plane
 from rnd_runtime.ground.standing import ground_of
 from rnd_runtime.motion.edit import edit_motion
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.aov import aov_image
 from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar, RenderedFrame, ground_share
 from rnd_runtime.playback.framing import CameraOptions, Framing, frame_motion, front_path
+from rnd_runtime.playback.scene import Person
 from rnd_runtime.raster.tone import tone_map
 from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.light import Light, brightest_direction, downsize, light_notes
@@ -34,7 +35,8 @@ from rnd_runtime.shading.shader import Shader
 from rnd_viewer.inputs.background import Background
 from rnd_viewer.inputs.options import parse_gain
 
-from .options import SIZES, ViewOptions
+from .options import SIZES, ViewOptions, probes
+from .people import ViewedPeople
 from .state import ViewState
 
 Floats32 = NDArray[np.float32]
@@ -70,7 +72,7 @@ class Scene:
 
     def __init__(self, options: ViewOptions, ahead: Future[Networks] | None = None) -> None:
         self._load(options, ahead)
-        self._files, self._up = _probes(options.hdr), options.hdr_up
+        self._files, self._up = probes(options.hdr), options.hdr_up
         self.name, self.size, self.threads = options.avatar.name, options.width_height, options.threads
         self._fit = options.size is None
         self._shader = lru_cache(MAX_SHADERS)(self._build_shader)
@@ -82,6 +84,7 @@ class Scene:
         self._posed: tuple[Motion, float, PosedAvatar] | None = None
         self._ground_light = lru_cache(MAX_SHADERS)(self._build_ground_light)
         self._ground = lru_cache(2)(partial(ground_of, self.avatar))
+        self._alone = lru_cache(2)(self._person)
         first = self._shader(self._files[0] if self._files else None, "table+sun")
         self.renderer = FrameRenderer(self.avatar, first, raster=options.raster)
 
@@ -240,6 +243,10 @@ class Scene:
         self, state: ViewState, camera: Camera, motion: Motion, time_s: float, grounded: bool, seconds: dict[str, float]
     ) -> RenderedFrame:
         """The frame of ``state``, with the ``ground`` where it is ``grounded``; adds to the stages' ``seconds``."""
+        alone = self._alone(motion)
+        if state.gaussians is None and any(alone.levels_at(time_s, camera)):
+            plane = self._ground(motion) if grounded else None
+            return self._draw_people(alone, state, camera, time_s, plane, seconds)
         body = self._pose(motion, time_s, seconds)
         shown = body._replace(gaussians=self._changed(state, body.gaussians))
         frame = self.renderer.draw(shown, camera, aovs=aovs_of(state), lit=not aovs_of(state), srgb=False)
@@ -250,6 +257,22 @@ class Scene:
         times = {**frame.stage_seconds, "ground": perf_counter() - started}
         return replace(frame, ground=share, stage_seconds=times)
 
+    def _draw_people(
+        self,
+        people: ViewedPeople,
+        state: ViewState,
+        camera: Camera,
+        time_s: float,
+        ground: Plane | None,
+        seconds: dict[str, float],
+    ) -> RenderedFrame:
+        """The frame of ``state`` at the levels of detail that it needs."""
+        bodies, change = people.bodies(time_s, camera, seconds), partial(self._changed, state)
+        self.renderer.ground, light = ground, None if ground is None else self._turned_ground_light(state)
+        frame = people.draw(bodies, camera, aovs=aovs_of(state), srgb=False, change=change, ground_light=light)
+        self.renderer.ground = None
+        return frame
+
     def _changed(self, state: ViewState, gaussians: Gaussians) -> Gaussians:
         """Fewer, or of one albedo, where ``state`` wants that."""
         if state.gaussians is not None:
@@ -258,6 +281,9 @@ class Scene:
         if state.output == "light":
             gaussians = replace(gaussians, albedo=np.full_like(gaussians.albedo, CLAY))
         return gaussians
+
+    def _person(self, motion: Motion) -> ViewedPeople:
+        return ViewedPeople([Person(self.avatar, motion)], self.renderer)
 
     def _pose(self, motion: Motion, time_s: float, seconds: dict[str, float]) -> PosedAvatar:
         """Cached while only camera and light move."""
@@ -360,19 +386,3 @@ def _fewer(gaussians: Gaussians, count: int) -> Gaussians:
     kept = np.arange(count) * total // count
     fewer = gaussians.only(kept)
     return replace(fewer, covariances=fewer.covariances * np.float32(total / count))
-
-
-def _probes(paths: tuple[Path, ...]) -> list[Path]:
-    """The light probes among ``paths`` and in their folders."""
-    files: list[Path] = []
-    for path in paths:
-        if path.is_dir():
-            inside = sorted(file for file in path.iterdir() if file.suffix.lower() in (".exr", ".hdr"))
-            if not inside:
-                raise InputError("--hdr", expected="light probes, .exr or .hdr", got="none", file=path)
-            files += inside
-        elif path.is_file():
-            files.append(path)
-        else:
-            raise InputError("light probe not found", file=path)
-    return files

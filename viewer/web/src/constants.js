@@ -56,6 +56,21 @@ export const TWIST_STEPS = 3;
 export const SMALLEST_SQUARE = 9.999999974752427e-07;
 // rnd_runtime.posing.rest
 export const DEEPEST = 60.0;
+// rnd_runtime.posing.levels
+export const KEPT = 0.985;
+export const CULLED_LEVELS = [[4, -0.6], [16, -0.5], [32, -0.4]];
+export const PARTNER_WINDOW = 96;
+export const MIN_COSINE = 0.6;
+export const PARTNER_REACH = 2.5;
+export const COLOUR_WEIGHT = 50.0;
+export const GROWTH = 0.5;
+export const CURVE_BITS = 10;
+export const NOWHERE = 1000.0;
+// rnd_runtime.avatar.avatar
+export const MIN_GAUSSIANS = 1500;
+// rnd_runtime.playback.scene
+export const LEVEL_SPACING = 1.3;
+export const NODE_SPACING = 48.0;
 // rnd_runtime.shading.sh
 export const SH_COUNT = 16;
 export const SH_DEGREES = [0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3];

@@ -60,3 +60,23 @@ export const transposed = (a) => [a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5]
 
 /** a · v of a 3×3 and [3]. */
 export const rotate = (a, v) => [0, 1, 2].map((k) => a[3 * k] * v[0] + a[3 * k + 1] * v[1] + a[3 * k + 2] * v[2]);
+
+/** Eigenvalues of a symmetric 3×3 `m`, ascending, and its unit eigenvectors as columns of `axes` [9] (Jacobi 1846). */
+export function principalAxes(m) {
+  const a = Float64Array.from(m), v = Float64Array.of(1, 0, 0, 0, 1, 0, 0, 0, 1);
+  for (let sweep = 0; sweep < 12; sweep++)
+    for (const [p, q] of [[0, 1], [0, 2], [1, 2]]) {
+      const off = a[3 * p + q];
+      if (!off) continue;
+      const theta = (a[4 * q] - a[4 * p]) / (2 * off), t = Math.sign(theta || 1) / (Math.abs(theta) + Math.hypot(theta, 1));
+      const c = 1 / Math.hypot(t, 1), s = t * c;
+      for (const [values, stride, step] of [[a, 3, 1], [a, 1, 3], [v, 3, 1]])  // columns of m, then its rows; columns of v
+        for (let k = 0; k < 3; k++) {
+          const x = values[stride * k + step * p], y = values[stride * k + step * q];
+          values[stride * k + step * p] = c * x - s * y;
+          values[stride * k + step * q] = s * x + c * y;
+        }
+    }
+  const order = [0, 1, 2].sort((i, j) => a[4 * i] - a[4 * j]);
+  return { values: order.map((i) => a[4 * i]), axes: Float64Array.from({ length: 9 }, (_, k) => v[3 * Math.floor(k / 3) + order[k % 3]]) };
+}

@@ -1,6 +1,6 @@
 // Reads files and renders states; states and answers are those of rnd-view.
 
-import { CLAY, COSINE_LOBE, LARGEST_SKY, PROBE_SHAPE } from "./constants.js";
+import { CLAY, COSINE_LOBE, LARGEST_SKY, MARGIN, NEAR, PROBE_SHAPE } from "./constants.js";
 import { Avatar } from "./posing/avatar.js";
 import { cameraOf } from "../../rnd_viewer/view/page/camera.js";
 import { homeView, inFrame, projectJoints } from "./camera.js";
@@ -88,17 +88,20 @@ async function render({ number, state }) {
     clock("ground");
   }
   if (!posed || posed.time !== state.time) {
-    const encoded = await avatar.encode(motion, state.time);
+    posed = { time: state.time, encoded: await avatar.encode(motion, state.time) };
     clock("encoders");
-    posed = { time: state.time, gaussians: avatar.posed(encoded) };
+  }
+  const camera = cameraOf(state), level = state.gaussians === null ? avatar.level(posed.encoded, sizeOf(camera, posed.encoded.joints)) : null;
+  if (!posed.gaussians || posed.level !== level) {
+    Object.assign(posed, { level, gaussians: avatar.posed(posed.encoded, level) });
     clock("posing");
   }
-  const camera = cameraOf(state), count = Math.min(state.gaussians ?? avatar.gaussians, avatar.gaussians);
-  const grown = avatar.gaussians / count, gaussians = fewer(posed.gaussians, count), beside = inFrame(camera, gaussians.root);
+  const whole = posed.gaussians.count, count = Math.min(state.gaussians ?? whole, whole), grown = whole / count;
+  const gaussians = fewer(posed.gaussians, count), beside = inFrame(camera, gaussians.root);
   const features = lit
     ? radianceOf(state, gaussians, count, beside.position, grown) : material(state.output, gaussians, count, beside);
   clock("shading");
-  const view = fineView(beside, gaussians.rootJoints), records = project(gaussians, count, features, view.camera, grown, avatar.cull);
+  const view = fineView(beside, gaussians.rootJoints, gaussians.least), records = project(gaussians, count, features, view.camera, grown, gaussians.cull);
   clock("sorting");
   if (splatter.isLost()) {  // the driver was reset
     splatter = new Splatter();
@@ -113,8 +116,14 @@ async function render({ number, state }) {
   clock("splatting");
   const joints = projectJoints(gaussians.joints, camera);
   const { notes, sun } = scene.lights[state.light];
-  const answer = { kind: "frame", number, width: state.width, height: state.height, image, joints, notes, sun, times: clock.times };
+  const answer = { kind: "frame", number, width: state.width, height: state.height, image, joints, notes, sun, gaussians: count, times: clock.times };
   postMessage(answer, [image]);
+}
+
+/** Pixels per metre at a body with `joints` [J·3] m in the world, the first of which is the root's; Infinity where it is too near. */
+function sizeOf({ rotation: r, translation: t, focal }, [x, y, z]) {
+  const depth = r[6] * x + r[7] * y + r[8] * z + t[2] - MARGIN;
+  return depth > NEAR ? focal / depth : Infinity;
 }
 
 /** `count` Gaussians at even steps through the file, which is in spatial order. */

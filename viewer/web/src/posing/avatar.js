@@ -2,16 +2,19 @@
 
 import * as ort from "./ort/ort.wasm.min.mjs";
 import {
-  ADVICE_KEY, CONSTANT_OUTPUTS, LARGEST_ALBEDO, METADATA_KEY, NODE_LOGITS, NODE_OUTPUTS, POSED_OUTPUTS, REST_OUTPUTS, SCHEMA,
+  ADVICE_KEY, CONSTANT_OUTPUTS, LARGEST_ALBEDO, METADATA_KEY, MIN_PIXELS_PER_METRE, NODE_LOGITS, NODE_OUTPUTS, POSED_OUTPUTS, REST_OUTPUTS,
+  SCHEMA,
 } from "../constants.js";
 import { refusal } from "../errors.js";
 import { shareTwists } from "./forearm.js";
+import { Levels } from "./levels.js";
 import { motionWindow, poseAt } from "../motion/motion.js";
 import { OnnxFile } from "../files/onnx.js";
 import { RestPose } from "./posing.js";
 import { multiply, rotate } from "../rotations.js";
 
 const EVERYTHING = -2;  // below every n·v
+const MAKING = 0.02;  // s that the levels of detail which are still missing may take of a frame
 
 export class Avatar {
   /** Read the file; other files are refused. */
@@ -36,7 +39,12 @@ export class Avatar {
     avatar.albedo.forEach((value, k) => { avatar.albedo[k] = Math.min(value, LARGEST_ALBEDO); });
     const posesItself = [...NODE_OUTPUTS, ...REST_OUTPUTS].every((name) => file.outputs.has(name));
     avatar.outputs = posesItself ? [...NODE_OUTPUTS, NODE_LOGITS].filter((name) => file.outputs.has(name)) : POSED_OUTPUTS;
-    if (posesItself) avatar.rest = new RestPose(about.gaussians, await constants(file, REST_OUTPUTS));
+    if (posesItself) {
+      const known = await constants(file, REST_OUTPUTS);
+      avatar.rest = new RestPose(about.gaussians, known);
+      avatar.spacing = about.spacing_m;
+      avatar.dynamicNodes = about.variant?.dynamic_nodes ?? 0;
+    }
     [avatar.session, avatar.inputs] = await sessionOf(file, avatar.outputs);
     return avatar;
   }
@@ -65,12 +73,24 @@ export class Avatar {
     return { values: this.outputs.map((name) => made[name].data), bones, root, joints };
   }
 
+  /** The level of detail, see `Levels`, for what was encoded at `size` pixels per metre; null: the avatar itself. */
+  level({ values }, size) {
+    if (!this.rest) return null;
+    const { rest, opacities, albedo, roughness, spacing, cull, dynamicNodes, gaussians: count } = this, nodes = values[0].length / 6;
+    const fewer = [0, nodes].includes(dynamicNodes) && nodes !== count;
+    this.levels ??= new Levels({ ...rest, opacities, albedo, roughness }, { spacing, nodes, fewer, cull });
+    return this.levels.at(size, MAKING);
+  }
+
   /** The Gaussians of what was encoded, as rnd_runtime/core/gaussians.py has them, in the frame of the `root`: {rotation [9],
-   *  translation [3]} → world; `rootJoints` [J·3] m in that frame, `joints` [J·3] m in the world. */
-  posed({ values, bones, root, joints }) {
-    const posed = this.rest ? this.rest.pose(values, bones) : values, { gaussians: count, opacities, albedo, roughness } = this;
-    const rootJoints = moved(bones, this.skeleton.rest);
-    return { count, ...Object.fromEntries(POSED_OUTPUTS.map((name, k) => [name, posed[k]])), opacities, albedo, roughness, root, rootJoints, joints };
+   *  translation [3]} → world; `rootJoints` [J·3] m in that frame, `joints` [J·3] m in the world. At a `level` of detail they
+   *  are fewer, and its shadows and pixels coarser: `detail` of the avatar's along each side, `least` pixels per metre (see `fineView`). */
+  posed({ values, bones, root, joints }, level = null) {
+    const { rest, opacities, albedo, roughness, cull } = level ?? this, fields = level ? values.map((value) => level.ofItsNodes(value)) : values;
+    const posed = rest ? rest.pose(fields, bones) : values, rootJoints = moved(bones, this.skeleton.rest);
+    const detail = level ? this.spacing / level.spacing : 1, least = level ? Math.min(1 / level.spacing, MIN_PIXELS_PER_METRE) : MIN_PIXELS_PER_METRE;
+    const outputs = Object.fromEntries(POSED_OUTPUTS.map((name, k) => [name, posed[k]]));
+    return { count: opacities.length, ...outputs, opacities, albedo, roughness, cull, detail, least, root, rootJoints, joints };
   }
 }
 

@@ -1,10 +1,11 @@
 // Bodies of few pixels on a finer grid, averaged by blend.frag (rnd_runtime/playback/far.py).
 
-import { MARGIN, MAX_FACTOR, MIN_PIXELS_PER_METRE, NEAR } from "../constants.js";
+import { MARGIN, MAX_FACTOR, NEAR } from "../constants.js";
 
 /** What to render of `camera` for a body around `points` [N·3] m of its frame: {camera, factor, corner, extent}. The image's
- *  `extent` px from `corner` on has `factor`² pixels of the finer camera in each of its own; 1: it is `camera` itself. */
-export function fineView(camera, points) {
+ *  `extent` px from `corner` on has `factor`² pixels of the finer camera in each of its own, so that they are `least` a metre or
+ *  more; 1: it is `camera` itself. */
+export function fineView(camera, points, least) {
   const { rotation: r, translation: t, focal, width, height } = camera;
   const plain = { camera, factor: 1, corner: [0, 0], extent: [width, height] };
   const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x);
@@ -18,7 +19,7 @@ export function fineView(camera, points) {
   }
   nearest -= MARGIN;
   if (!(nearest >= NEAR && nearest < Infinity)) return plain;  // NaN too
-  const factor = Math.min(Math.ceil(MIN_PIXELS_PER_METRE * nearest / focal), MAX_FACTOR);
+  const factor = Math.min(Math.ceil(least * nearest / focal), MAX_FACTOR);
   if (factor <= 1) return plain;
   const from = [Infinity, Infinity], to = [-Infinity, -Infinity];
   for (let corner = 0; corner < 8; corner++) {

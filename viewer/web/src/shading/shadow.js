@@ -24,7 +24,7 @@ export function discRadii({ covariances, opacities }, count, covarianceScale) {
 }
 
 /** Visibility [count]; Gaussians with numbers that are not finite neither cast nor receive. */
-function sunVisibility(direction, { means, normals }, count, radii) {
+function sunVisibility(direction, { means, normals, detail = 1 }, count, radii) {
   const [x, y, z] = frameOf(direction), position = new Float32Array(3 * count), normal = new Float32Array(3 * count);
   const visibility = new Float32Array(count);
   let left = Infinity, right = -Infinity, low = Infinity, high = -Infinity;
@@ -45,7 +45,7 @@ function sunVisibility(direction, { means, normals }, count, radii) {
     high = Math.max(high, up);
   }
   const spans = [right - left, high - low].map((span) => Math.max(span, 0)), extent = Math.max(...spans);
-  const texel = (extent > 0 ? extent : 1) / (SHADOW_RESOLUTION - 3);  // centres at integers, empty rows around, one for rounding
+  const texel = (extent > 0 ? extent : 1) / (Math.round(SHADOW_RESOLUTION * detail) - 3);  // centres at integers, empty rows around, one for rounding
   const [width, height] = spans.map((span) => Math.floor(span / texel) + 4);
   const map = { depth: new Float32Array(width * height).fill(-Infinity), width, height, texel };
   for (let i = 0; i < count; i++) {
