@@ -7,8 +7,8 @@ import numpy as np
 from rnd_bench.cli import main
 from rnd_bench.speed import scenes
 from rnd_bench.speed.roofline import network_flops
-from rnd_runtime.avatar.avatar import MIN_GAUSSIANS, Avatar
-from rnd_runtime.posing.levels import CULLED_LEVELS
+from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.posing.levels import CULLED_LEVELS, MIN_GAUSSIANS
 from support.paths import ASSETS
 
 

@@ -55,6 +55,8 @@ class FakeAvatar:
         """It has no others than the whole."""
         return self if number == 0 else None
 
+    detail = level  # both have what there is of it
+
     def encode(self, motion: Motion, time: float) -> Encoded:
         now = motion.at([time])
         joints = self.skeleton.joint_transforms(now.rotations[0], now.translations[0])[:, :3]

@@ -36,9 +36,9 @@ SHARED = {
     "rnd_runtime.posing.skinning": "SHORTEST TWIST_STEPS SMALLEST_SQUARE",
     "rnd_runtime.posing.rest": "_DEEPEST",
     "rnd_runtime.posing.levels": (
-        "KEPT CULLED_LEVELS PARTNER_WINDOW MIN_COSINE PARTNER_REACH COLOUR_WEIGHT GROWTH _CURVE_BITS _NOWHERE"
+        "KEPT CULLED_LEVELS PARTNER_WINDOW MIN_COSINE PARTNER_REACH COLOUR_WEIGHT GROWTH MIN_GAUSSIANS"
+        " _CURVE_BITS _NOWHERE"
     ),
-    "rnd_runtime.avatar.avatar": "MIN_GAUSSIANS",
     "rnd_runtime.playback.scene": "LEVEL_SPACING NODE_SPACING",
     "rnd_runtime.shading.sh": "SH_COUNT SH_DEGREES COSINE_LOBE _C0 _C1 _C2_SIDE _C2_ZONAL _C3_3 _C3_2 _C3_1 _C3_0",
     "rnd_runtime.shading.files.channels": "REC709 _SAME_COLOUR",

@@ -18,7 +18,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton, taken_along
-from rnd_runtime.posing.levels import CULLED_LEVELS, Surface, coarser, on_fewer_nodes
+from rnd_runtime.posing.levels import CULLED_LEVELS, MergedLevels, Surface, on_fewer_nodes
 from rnd_runtime.posing.rest import RestPose, Unposed
 from rnd_runtime.posing.window import moment
 from rnd_runtime.shading.brdf import LARGEST_ALBEDO
@@ -26,8 +26,13 @@ from rnd_runtime.shading.brdf import LARGEST_ALBEDO
 from .file import REST_OUTPUTS
 from .networks import Networks
 
-MIN_GAUSSIANS = 1500
-"""of a level that has a coarser one"""
+
+class Detail(NamedTuple):
+    """What there is of an avatar at a level of detail: mean distances of its Gaussians and of its nodes in m."""
+
+    gaussians: int
+    spacing: float
+    node_spacing: float
 
 
 class Encoded(NamedTuple):
@@ -77,7 +82,8 @@ class Avatar:
         self._albedo = np.minimum(albedo, np.float32(LARGEST_ALBEDO))
         self.posed_outside = networks.posed_outside
         self._rest = _rest_pose(networks) if networks.posed_outside else None
-        self._levels = [self]
+        self._levels = [self]  # of all levels, as is the next
+        self._merging: list[MergedLevels] = []
 
     @classmethod
     def load(cls, path: str | Path, *, threads: int | None = None, ahead: Future[Networks] | None = None) -> Avatar:
@@ -100,16 +106,45 @@ class Avatar:
         """At a level of detail: 0 is itself, others are for fewer and fewer pixels; None beyond the coarsest.
 
         The first have all Gaussians and a share of the nodes, where the file allows that, and leave out the body's far
-        side; others have no more nodes. They are made on first use, each in a hundredth of a second, and kept.
+        side; others have no more nodes. They are made on first use, each in a hundredth of a second.
         """
-        by_nodes = CULLED_LEVELS if self._levels[0]._networks.can_leave_out_nodes else ()
-        while len(self._levels) <= number:
-            whole, coarsest, made = self._levels[0], self._levels[-1], len(self._levels) - 1
-            level = whole._culled(*by_nodes[made]) if made < len(by_nodes) else coarsest._merged()
-            if level is None:
-                return None
-            self._levels.append(level)
-        return self._levels[number]
+        if number < len(self._unmerged):
+            return self._unmerged[number]
+        if (detail := self.detail(number)) is None:
+            return None
+        surface = self._merged.surface(number - len(self._unmerged) + 1)
+        level = shallow_copy(self._unmerged[-1], gaussians=detail.gaussians, spacing=detail.spacing)
+        level._rest, level._opacities, level._albedo, level._roughness = surface
+        return level
+
+    def detail(self, number: int) -> Detail | None:
+        """What ``level`` would have."""
+        if number < len(self._unmerged):
+            level = self._unmerged[number]
+            return Detail(level.gaussians, level.spacing, level.node_spacing)
+        if self._unmerged[0]._rest is None:
+            return None
+        if (fewer := self._merged.count(number - len(self._unmerged) + 1)) is None:
+            return None
+        finest = self._unmerged[-1]
+        return Detail(fewer, finest.spacing * math.sqrt(finest.gaussians / fewer), finest.node_spacing)
+
+    @property
+    def _unmerged(self) -> list[Avatar]:
+        """Levels with all Gaussians."""
+        if len(self._levels) == 1 and self._networks.can_leave_out_nodes:
+            self._levels += [self._culled(*each) for each in CULLED_LEVELS]
+        return self._levels
+
+    @property
+    def _merged(self) -> MergedLevels:
+        """Levels with fewer, from the last one with all on."""
+        if not self._merging:
+            finest = self._unmerged[-1]
+            assert finest._rest is not None
+            surface = Surface(finest._rest, finest._opacities, finest._albedo, finest._roughness)
+            self._merging.append(MergedLevels(surface))
+        return self._merging[0]
 
     def _culled(self, share: int, cull: float) -> Avatar:
         """On every ``share``-th node, without what is below n·v = ``cull``."""
@@ -120,20 +155,9 @@ class Avatar:
         level._networks, level._rest = self._networks.at_nodes(kept.tolist()), on_fewer_nodes(self._rest, kept)
         return level
 
-    def _merged(self) -> Avatar | None:
-        """With fewer Gaussians; None where it is the coarsest."""
-        if self._rest is None or self.gaussians <= MIN_GAUSSIANS:
-            return None
-        surface = coarser(Surface(self._rest, self._opacities, self._albedo, self._roughness))
-        if (fewer := len(surface.opacities)) == self.gaussians:
-            return None
-        level = shallow_copy(self, gaussians=fewer, spacing=self.spacing * math.sqrt(self.gaussians / fewer))
-        level._rest, level._opacities, level._albedo, level._roughness = surface
-        return level
-
     @property
     def node_spacing(self) -> float:
-        return self.spacing * math.sqrt(self.gaussians / self.nodes)
+        return self.spacing * math.sqrt(self.gaussians / self.nodes) if self.nodes else math.inf
 
     def scale_albedo(self, gain: Sequence[float]) -> None:
         """Multiply the albedo by ``gain`` [3] of linear R, G and B; it stays below what conserves energy.

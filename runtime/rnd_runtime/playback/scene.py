@@ -115,7 +115,7 @@ def ground_under(people: Sequence[Person]) -> Plane:
 def greatest_sizes(avatar: Avatar, smallest: float = 0.0) -> Floats:
     """Pixels per metre [L], falling, up to which each level of detail is taken; to the first below ``smallest``."""
     sizes = [np.inf]
-    while sizes[-1] >= smallest and (level := avatar.level(len(sizes))) is not None:
+    while sizes[-1] >= smallest and (level := avatar.detail(len(sizes))) is not None:
         whole = level.gaussians == avatar.gaussians
         size = NODE_SPACING / level.node_spacing if whole else LEVEL_SPACING / level.spacing
         sizes.append(min(size, sizes[-1]))
@@ -167,7 +167,7 @@ class SceneRenderer:
             if len(self.people) > 1 or smallest < LEVEL_SPACING / avatar.spacing:
                 levels[:, number] = chosen_levels(sizes, greatest_sizes(avatar, smallest))
         if len(self.people) == 1 and levels.any():
-            made = [avatar.level(number) for number in range(int(levels.max()) + 1)]
+            made = [avatar.detail(number) for number in range(int(levels.max()) + 1)]
             levels[np.array([level is None or level.gaussians == avatar.gaussians for level in made])[levels]] = 0
         return levels
 

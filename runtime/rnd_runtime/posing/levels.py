@@ -8,7 +8,7 @@ keeps the coverage of the body.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -29,9 +29,13 @@ MIN_COSINE = 0.6  # of the normals of a pair
 PARTNER_REACH = 2.5  # median distances to the nearest neighbour on the same side that a pair may be apart
 COLOUR_WEIGHT = 50.0  # of squared differences of albedo, against squared distances
 GROWTH = 0.5  # exponent: when 40 % are left, a body has lost 1 % of its coverage at 0 and gained 1 % at 0.5
+MIN_GAUSSIANS = 1500
+"""of a level that has a coarser one"""
+ROWS_AT_HAND = 250_000
+"""of all levels of an avatar: 60 MB"""
 _CURVE_BITS = 10  # of a coordinate on the curve
 _NOWHERE = 1e3  # m
-_ROWS = 1024  # Gaussians whose distances to all nodes are kept at once
+_CHUNK = 1024  # Gaussians whose distances to all nodes are kept at once
 
 
 def on_fewer_nodes(rest: RestPose, kept: NDArray[np.int64]) -> RestPose:
@@ -45,7 +49,7 @@ def on_fewer_nodes(rest: RestPose, kept: NDArray[np.int64]) -> RestPose:
     nodes[~np.isfinite(nodes)] = _NOWHERE  # no Gaussian uses it
     count = min(rest.neighbours.shape[1], len(kept))
     neighbours, squares = [], []
-    for part in np.array_split(points, len(points) // _ROWS + 1):
+    for part in np.array_split(points, len(points) // _CHUNK + 1):
         distances = (part**2).sum(axis=1)[:, None] + (nodes**2).sum(axis=1) - 2 * part @ nodes.T
         nearest = np.argpartition(distances, count - 1, axis=1)[:, :count]
         neighbours.append(nearest)
@@ -54,6 +58,10 @@ def on_fewer_nodes(rest: RestPose, kept: NDArray[np.int64]) -> RestPose:
     kernel = 1 / (distances + distances.min(axis=1).mean())
     shares = (kernel / kernel.sum(axis=1, keepdims=True)).astype(np.float32)
     return replace(rest, neighbours=np.concatenate(neighbours).astype(np.int32), neighbour_weights=shares)
+
+
+_ROWS = ("neighbours", "neighbour_weights", "log_template", "points", "factors", "normals", "limbs")
+"""of a ``RestPose``: one for each Gaussian"""
 
 
 class Surface(NamedTuple):
@@ -65,47 +73,89 @@ class Surface(NamedTuple):
     roughness: Floats32
 
 
-def coarser(surface: Surface) -> Surface:
-    """``surface`` with ``KEPT`` of its Gaussians, or more where too few are alike; the others stay as they are."""
-    rest, opacities, albedo, roughness = surface
-    a, b = _pairs(rest.points.astype(np.float64), rest.normals.astype(np.float64), albedo.astype(np.float64))
-    first, second = (_covariances(rest.factors[each]) for each in (a, b))
+class MergedLevels:
+    """Levels of ``surface``, each with ``KEPT`` of the Gaussians of the one before, or more where too few are alike.
+
+    Level 0 is ``surface``. A merged pair becomes one more row of common arrays, and a level is a list of rows; no more
+    than ``ROWS_AT_HAND`` of the levels' own arrays are kept.
+    """
+
+    def __init__(self, surface: Surface) -> None:
+        count = len(surface.opacities)
+        self._rows = [np.arange(count)]
+        self._pool, self._used = _taken(surface, np.arange(2 * count) % count), count
+        self._at_hand = {0: surface}
+
+    def count(self, level: int) -> int | None:
+        """Number of the Gaussians of ``level``; None where there is none."""
+        while len(self._rows) <= level:
+            if len(self._rows[-1]) <= MIN_GAUSSIANS or not self._add():
+                return None
+        return len(self._rows[level])
+
+    def surface(self, level: int) -> Surface:
+        """A level that there is."""
+        found = self._at_hand.pop(level, None) or _taken(self._pool, self._rows[level])
+        self._at_hand[level] = found  # the latest
+        kept = 0
+        for other in reversed([*self._at_hand]):
+            kept += len(self._rows[other])
+            if other and other != level and kept > ROWS_AT_HAND:
+                del self._at_hand[other]
+        return found
+
+    def _add(self) -> bool:
+        """Merge the most alike pairs of the last level; False where none are alike."""
+        rows = self._rows[-1]
+        places = (self._pool.rest.points[rows], self._pool.rest.normals[rows], self._pool.albedo[rows])
+        a, b = _pairs(*(values.astype(np.float64) for values in places))
+        new = np.arange(self._used, self._used + len(a))
+        merged = merged_pairs(self._pool, rows[a], rows[b])
+        for name in _ROWS:
+            getattr(self._pool.rest, name)[new] = getattr(merged.rest, name)
+        for ours, theirs in zip(self._pool[1:], merged[1:]):
+            ours[new] = theirs
+        self._used += len(a)
+        fewer = rows.copy()
+        fewer[a] = new
+        self._rows.append(np.delete(fewer, b))
+        return len(a) > 0
+
+
+def _taken(surface: Surface, rows: NDArray[np.int64]) -> Surface:
+    """The Gaussians ``rows`` of ``surface``."""
+    rest = replace(surface.rest, **{name: getattr(surface.rest, name)[rows] for name in _ROWS})
+    return Surface(rest, *(values[rows] for values in surface[1:]))
+
+
+def merged_pairs(surface: Surface, a: NDArray[np.int64], b: NDArray[np.int64]) -> Surface:
+    """Gaussians in place of the pairs of rows ``a`` and ``b`` of ``surface``."""
+    (one, opacities, albedo, roughness), (other, *others) = _taken(surface, a), _taken(surface, b)
+    first, second = _covariances(one.factors), _covariances(other.factors)
     areas = _areas(_variances(first)), _areas(_variances(second))
-    weights = [np.maximum(area * opacities[each], 1e-30) for area, each in zip(areas, (a, b))]
+    weights = [np.maximum(area * values, 1e-30) for area, values in zip(areas, (opacities, others[0]))]
     share = weights[0] / (weights[0] + weights[1])
 
-    def mean(one: NDArray[np.floating], other: NDArray[np.floating]) -> Floats:
-        ours = share.reshape(-1, *[1] * (one.ndim - 1))
-        return np.asarray(ours * one + (1 - ours) * other, np.float64)
+    def mean(ours: NDArray[np.floating], theirs: NDArray[np.floating]) -> Floats:
+        own = share.reshape(-1, *[1] * (ours.ndim - 1))
+        return np.asarray(own * ours + (1 - own) * theirs, np.float64)
 
-    apart = (rest.points[b] - rest.points[a]).astype(np.float64)
+    apart = (other.points - one.points).astype(np.float64)
     spread = (share * (1 - share))[:, None, None] * apart[:, :, None] * apart[:, None, :]
     variances, axes = np.linalg.eigh(mean(first, second) + spread)
     growth = np.maximum((areas[0] + areas[1]) / np.maximum(_areas(variances), 1e-30), 1) ** GROWTH
     variances = np.maximum(variances, 0) * np.stack([np.ones_like(growth), growth, growth], axis=1)
-    normal = mean(rest.normals[a], rest.normals[b])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    kept = np.delete(np.arange(len(opacities)), b)
-    merged, heavier = np.searchsorted(kept, a), np.where(share >= 0.5, a, b)
-
-    def with_merged(values: NDArray[Any], of_pairs: NDArray[Any] | None = None) -> NDArray[Any]:
-        """``values`` of those left, and of pairs: ``of_pairs``, by default the heavier one's."""
-        left = values[kept]
-        left[merged] = values[heavier] if of_pairs is None else of_pairs
-        return left
-
-    factors = (axes * np.sqrt(variances)[:, None, :]).reshape(-1, 9)
-    fewer = replace(
-        rest,
-        neighbours=with_merged(rest.neighbours),
-        neighbour_weights=with_merged(rest.neighbour_weights),
-        log_template=with_merged(rest.log_template),
-        points=with_merged(rest.points, mean(rest.points[a], rest.points[b])),
-        factors=with_merged(rest.factors, factors),
-        normals=with_merged(rest.normals, normal),
-        limbs=with_merged(rest.limbs),
+    normals = mean(one.normals, other.normals)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    heavier = _taken(surface, np.where(share >= 0.5, a, b)).rest
+    rest = replace(
+        heavier,
+        points=mean(one.points, other.points).astype(np.float32),
+        factors=(axes * np.sqrt(variances)[:, None, :]).reshape(-1, 9).astype(np.float32),
+        normals=normals.astype(np.float32),
     )
-    return Surface(fewer, *(with_merged(each, mean(each[a], each[b])) for each in (opacities, albedo, roughness)))
+    materials = zip((opacities, albedo, roughness), others)
+    return Surface(rest, *(mean(ours, theirs).astype(np.float32) for ours, theirs in materials))
 
 
 def _covariances(factors: Floats32) -> Floats:

@@ -1,17 +1,29 @@
 """Coarser levels: pairs by moments, alike first, against sums written out."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from rnd_runtime.posing import levels
-from rnd_runtime.posing.levels import GROWTH, KEPT, Surface, coarser
+from rnd_runtime.posing.levels import GROWTH, KEPT, MergedLevels, Surface
 
 
 @pytest.fixture(scope="module")
 def surface(avatar):
     return Surface(avatar._rest, avatar._opacities, avatar._albedo, avatar._roughness)
+
+
+@pytest.fixture(autouse=True)
+def _however_few(monkeypatch):
+    monkeypatch.setattr(levels, "MIN_GAUSSIANS", 0)
+
+
+def _next(surface):
+    made = MergedLevels(surface)
+    count = made.count(1)
+    return surface if count is None else made.surface(1)
 
 
 def _some(surface, rows, **changes):
@@ -21,7 +33,7 @@ def _some(surface, rows, **changes):
 
 
 def test_a_level_keeps_its_share_and_the_body(surface):
-    level = coarser(surface)
+    level = _next(surface)
     count = len(surface.opacities)
     assert len(level.opacities) == round(KEPT * count) == len(level.rest.points)
     unchanged = {tuple(point) for point in surface.rest.points} & {tuple(point) for point in level.rest.points}
@@ -42,7 +54,7 @@ def test_a_pair_is_merged_by_moments_and_grows(surface, monkeypatch):
     four = _some(surface, np.arange(4), points=points, factors=factors, normals=normals)
     opacities = np.float32([0.9, 0.6, 0.9, 0.9])
     albedo = np.float32([[0.5, 0.5, 0.5], [0.5, 0.5, 0.5], [0.8, 0.1, 0.1], [0.1, 0.1, 0.8]])
-    merged = coarser(Surface(four.rest, opacities, albedo, four.roughness))
+    merged = _next(Surface(four.rest, opacities, albedo, four.roughness))
     assert len(merged.opacities) == 3
     (row,) = np.flatnonzero(~(merged.rest.points[:, None] == points).all(2).any(1))
     share = 0.9 / 1.5
@@ -62,7 +74,7 @@ def test_sides_of_a_thin_body_are_not_merged(surface):
     normals = np.repeat(np.float32([[0, 0, -1], [0, 0, 1]]), count, axis=0)
     two = _some(surface, np.arange(2 * count), points=points, normals=normals)
     albedo = np.repeat(np.float32([[1, 0, 0], [0, 0, 1]]), count, axis=0)
-    level = coarser(Surface(two.rest, two.opacities, albedo, two.roughness))
+    level = _next(Surface(two.rest, two.opacities, albedo, two.roughness))
     assert len(level.opacities) < 2 * count
     assert {tuple(colour) for colour in level.albedo} == {(1, 0, 0), (0, 0, 1)}
     np.testing.assert_array_equal(level.rest.points[:, 2] > 0.0005, level.albedo[:, 2] > 0.5)
@@ -70,6 +82,20 @@ def test_sides_of_a_thin_body_are_not_merged(surface):
 
 def test_a_lone_gaussian_stays(surface):
     one = _some(surface, np.arange(1))
-    level = coarser(one)
-    np.testing.assert_allclose(level.rest.points, one.rest.points)
-    assert len(level.opacities) == 1
+    assert MergedLevels(one).count(1) is None
+
+
+def test_levels_are_made_again_and_few_are_kept(surface, monkeypatch):
+    made = MergedLevels(surface)
+    counts = [made.count(number) for number in range(12)]
+    assert all(round(KEPT * before) == after for before, after in pairwise(counts))
+    monkeypatch.setattr(levels, "ROWS_AT_HAND", 3 * counts[0])
+    first = [made.surface(number) for number in range(12)]
+    kept = [number for number in reversed(range(12)) if made.surface(number) is first[number]]
+    assert kept == [11, 10, 9, 0]
+    for number in (0, 3, 11):
+        again = made.surface(number)
+        assert len(again.opacities) == counts[number]
+        for name in ("points", "factors", "neighbours", "limbs"):
+            np.testing.assert_array_equal(getattr(again.rest, name), getattr(first[number].rest, name))
+        np.testing.assert_array_equal(again.albedo, first[number].albedo)

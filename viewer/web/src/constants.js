@@ -64,10 +64,9 @@ export const MIN_COSINE = 0.6;
 export const PARTNER_REACH = 2.5;
 export const COLOUR_WEIGHT = 50.0;
 export const GROWTH = 0.5;
+export const MIN_GAUSSIANS = 1500;
 export const CURVE_BITS = 10;
 export const NOWHERE = 1000.0;
-// rnd_runtime.avatar.avatar
-export const MIN_GAUSSIANS = 1500;
 // rnd_runtime.playback.scene
 export const LEVEL_SPACING = 1.3;
 export const NODE_SPACING = 48.0;
