@@ -31,8 +31,8 @@ COLOUR_WEIGHT = 50.0  # of squared differences of albedo, against squared distan
 GROWTH = 0.5  # exponent: when 40 % are left, a body has lost 1 % of its coverage at 0 and gained 1 % at 0.5
 MIN_GAUSSIANS = 1500
 """of a level that has a coarser one"""
-ROWS_AT_HAND = 250_000
-"""of all levels of an avatar: 60 MB"""
+ROWS_AT_HAND = 750_000
+"""of all levels of an avatar, 160 MB: a crowd of fifty that walks to and fro needs most of the levels of 12 000 Gaussians"""
 _CURVE_BITS = 10  # of a coordinate on the curve
 _NOWHERE = 1e3  # m
 _CHUNK = 1024  # Gaussians whose distances to all nodes are kept at once
@@ -95,12 +95,14 @@ class MergedLevels:
 
     def surface(self, level: int) -> Surface:
         """A level that there is."""
-        found = self._at_hand.pop(level, None) or _taken(self._pool, self._rows[level])
-        self._at_hand[level] = found  # the latest
-        kept = 0
+        if level in self._at_hand:
+            found = self._at_hand[level] = self._at_hand.pop(level)  # now the latest
+            return found
+        found = self._at_hand[level] = _taken(self._pool, self._rows[level])
+        rows = 0
         for other in reversed([*self._at_hand]):
-            kept += len(self._rows[other])
-            if other and other != level and kept > ROWS_AT_HAND:
+            rows += len(self._rows[other])
+            if other not in (0, level) and rows > ROWS_AT_HAND:
                 del self._at_hand[other]
         return found
 
