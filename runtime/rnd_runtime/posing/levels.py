@@ -32,7 +32,7 @@ GROWTH = 0.5  # exponent: when 40 % are left, a body has lost 1 % of its coverag
 MIN_GAUSSIANS = 1500
 """of a level that has a coarser one"""
 ROWS_AT_HAND = 750_000
-"""of all levels of an avatar, 160 MB: a crowd of fifty that walks to and fro needs most of the levels of 12 000 Gaussians"""
+"""of all levels of an avatar, 0.4 GB once they are posed: a crowd that walks to and fro takes a hundred levels"""
 _CURVE_BITS = 10  # of a coordinate on the curve
 _NOWHERE = 1e3  # m
 _CHUNK = 1024  # Gaussians whose distances to all nodes are kept at once
