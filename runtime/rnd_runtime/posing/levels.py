@@ -111,6 +111,8 @@ class MergedLevels:
         rows = self._rows[-1]
         places = (self._pool.rest.points[rows], self._pool.rest.normals[rows], self._pool.albedo[rows])
         a, b = _pairs(*(values.astype(np.float64) for values in places))
+        if not len(a):
+            return False
         new = np.arange(self._used, self._used + len(a))
         merged = merged_pairs(self._pool, rows[a], rows[b])
         for name in _ROWS:
@@ -121,7 +123,7 @@ class MergedLevels:
         fewer = rows.copy()
         fewer[a] = new
         self._rows.append(np.delete(fewer, b))
-        return len(a) > 0
+        return True
 
 
 def _taken(surface: Surface, rows: NDArray[np.int64]) -> Surface:
