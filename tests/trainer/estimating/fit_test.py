@@ -128,7 +128,7 @@ def test_derivatives_agree_with_differences(person, part, outlines):
     weights = replace(Weights(), smooth=0.0) if part == "shape" else Weights()  # smoothness counts a pose's part alone
     if outlines:
         weights = replace(Weights(), points=0, bones=0, prior=0, smooth=0, shared=0)
-    fit = Fit(few, lifted, default_figure(), _lens(few, 240.0, None), 1.7, replace(weights, ground=0.0))
+    fit = Fit(few, lifted, default_figure(), _lens(few, 240.0, None), 1.7, replace(weights, ground=0.0, slide=0.0))
     points, outline = fit._point_term(Stage(1)), None
     if outlines:  # wide limits: the weights of far matches are constants of a step
         outline = replace(fit._outline_term(), inner_weight=0.0, limit=1e4)

@@ -62,7 +62,8 @@ class Weights:
     outline: float = 0.5  # factor of the mask's outline against the body's
     inner: float = 0.15  # factor of body points that lie outside of the mask
     outline_m: float = 0.012  # deviation of outlines at the person's distance, m
-    ground: float = 0.03  # factor of feet on the ground
+    ground: float = 1.0  # factor of feet on the ground
+    slide: float = 0.03  # factor of standing feet that move
     shared: float = 0.1  # share of the frames that count as independent, in the weight of shape and focal length
 
 
@@ -269,7 +270,7 @@ class Fit:
         cost += bones(state, posed, figure, layout, equations)
         cost += PriorTerm(pose_prior(), w.prior)(posed, layout, equations)
         cost += self._smooth(posed, layout, equations)
-        cost += GroundTerm(self.times, w.ground)(state, posed, figure, marks, layout, equations)
+        cost += GroundTerm(self.times, w.ground, w.slide)(state, posed, figure, marks, layout, equations)
         cost += SharedTerm(lens, 1 + w.shared * len(state.translations), self.height)(
             state, figure, marks, layout, equations
         )

@@ -151,7 +151,8 @@ class GroundTerm:
     """Feet stand on a plane, do not sink into it, and stay put where they stand."""
 
     times: Floats
-    weight: float = 1.0
+    weight: float = 1.0  # of heights
+    slide_weight: float = 1.0
     height_m: float = 0.025
     reach_m: float = 0.06  # a point higher is in the air
     slip: float = 0.15  # m/s of a standing foot
@@ -198,9 +199,9 @@ class GroundTerm:
             equations.add(heights * scale, weight, height_by * scale, shared * scale)
             moved = (local / self.slip).reshape(len(local), -1, layout.unknowns)
             by = [-moved[:-1] / span, moved[1:] / span]
-            pair = np.repeat(weights * slide_kept**2, 3, axis=1) * self.weight
+            pair = np.repeat(weights * slide_kept**2, 3, axis=1) * self.slide_weight
             equations.add_chain(slide.reshape(len(slide), -1), pair, by)
-        return self.weight * (cost + slide_cost)
+        return self.weight * cost + self.slide_weight * slide_cost
 
 
 def _part(marks: Marks, chosen: NDArray[np.int64]) -> Marks:
