@@ -64,3 +64,17 @@ def broken_scene(field, value):
     array, place = places[field]
     array[place] = value
     return replace(rest, **changed), (logits, offsets, visibility, bones)
+
+
+def page_arrays(rest: RestPose) -> dict[str, np.ndarray]:
+    """The arrays of ``rest`` by the names that the static page's code has for them."""
+    return {
+        "neighbours": rest.neighbours,
+        "weights": rest.neighbour_weights,
+        "template": rest.log_template,
+        "points": rest.points,
+        "factors": rest.factors,
+        "normals": rest.normals,
+        "limbs": rest.limbs,
+        "limits": np.float32([rest.max_offset, rest.floor, rest.fallback]),
+    }

@@ -12,6 +12,7 @@ import pytest
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.playback.scene import chosen_levels, greatest_sizes
 from support.paths import ASSETS, ROOT
+from support.posing_scenes import page_arrays
 
 NODE = shutil.which("node")
 SIZES = (150.0, 90.0, 60.0)  # pixels per metre; of the whole avatar, and of two levels
@@ -49,14 +50,7 @@ def test_levels_are_the_runtimes(tmp_path):
     avatar = Avatar.load(ASSETS / "avatar.onnx", threads=1)
     rest = avatar._rest
     arrays = {
-        "neighbours": rest.neighbours,
-        "weights": rest.neighbour_weights,
-        "template": rest.log_template,
-        "points": rest.points,
-        "factors": rest.factors,
-        "normals": rest.normals,
-        "limbs": rest.limbs,
-        "limits": np.float32([rest.max_offset, rest.floor, rest.fallback]),
+        **page_arrays(rest),
         "opacities": avatar._opacities,
         "albedo": avatar._albedo,
         "roughness": avatar._roughness,

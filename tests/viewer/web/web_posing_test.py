@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 from rnd_runtime.posing.rest import RestPose
 from rnd_runtime.posing.skinning import PosedArrays
 from support.paths import ROOT
-from support.posing_scenes import posing_scene
+from support.posing_scenes import page_arrays, posing_scene
 
 NODE = shutil.which("node")
 ROUND_OFF = 3e-5  # of the largest value: the page computes in float64, the pass in float32
@@ -45,14 +45,7 @@ def _page(folder: Path, rest: RestPose, logits: Any, *fields: Any) -> PosedArray
     count = len(rest.points)
     arrays = {
         "count": np.int32([count]),
-        "neighbours": rest.neighbours,
-        "weights": rest.neighbour_weights,
-        "template": rest.log_template,
-        "points": rest.points,
-        "factors": rest.factors,
-        "normals": rest.normals,
-        "limbs": rest.limbs,
-        "limits": np.float32([rest.max_offset, rest.floor, rest.fallback]),
+        **page_arrays(rest),
         "offsets": nodes[0],
         "visibility": nodes[1],
         **({} if logits is None else {"logits": logits}),

@@ -1,6 +1,7 @@
 // Reads files and renders states; states and answers are those of rnd-view.
 
 import { CLAY, COSINE_LOBE, LARGEST_SKY, MARGIN, NEAR, PROBE_SHAPE } from "./constants.js";
+import { taken } from "./arrays.js";
 import { Avatar } from "./posing/avatar.js";
 import { cameraOf } from "../../rnd_viewer/view/page/camera.js";
 import { homeView, inFrame, projectJoints } from "./camera.js";
@@ -130,13 +131,9 @@ function sizeOf({ rotation: r, translation: t, focal }, [x, y, z]) {
 function fewer(gaussians, count) {
   const total = gaussians.count, kept = { ...gaussians, count };
   if (count === total) return gaussians;
-  for (const name of ["means", "covariances", "normals", "visibility", "opacities", "albedo", "roughness"]) {
-    const all = gaussians[name], width = all.length / total, some = kept[name] = new Float32Array(width * count);
-    for (let i = 0; i < count; i++) {
-      const from = width * Math.floor(i * total / count);
-      some.set(all.subarray(from, from + width), width * i);
-    }
-  }
+  const rows = Int32Array.from({ length: count }, (_, i) => Math.floor(i * total / count));
+  for (const name of ["means", "covariances", "normals", "visibility", "opacities", "albedo", "roughness"])
+    kept[name] = taken(gaussians[name], gaussians[name].length / total, rows);
   return kept;
 }
 

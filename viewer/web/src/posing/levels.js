@@ -4,6 +4,7 @@ import {
   COLOUR_WEIGHT, CULLED_LEVELS, CURVE_BITS, GROWTH, KEPT, LEVEL_SPACING, MIN_COSINE, MIN_GAUSSIANS, NODE_SPACING, PARTNER_REACH,
   PARTNER_WINDOW,
 } from "../constants.js";
+import { median, taken } from "../arrays.js";
 import { principalAxes } from "../rotations.js";
 import { onFewerNodes } from "./fewer_nodes.js";
 import { RestPose } from "./posing.js";
@@ -90,23 +91,13 @@ export class Levels {
 
   /** {number, spacing m, cull, rest, opacities, albedo, roughness, ofItsNodes} of a level; the last takes its nodes' values from all. */
   #made(number) {
-    const rows = this.lists[number], taken = {};
-    for (const [name, width] of Object.entries(this.widths)) {
-      const all = this.pool[name], some = taken[name] = new all.constructor(width * rows.length);
-      rows.forEach((row, i) => some.set(all.subarray(width * row, width * (row + 1)), width * i));
-    }
-    const { neighbours, weights, template, points, normals, factors, limbs, opacities, albedo, roughness } = taken;
+    const rows = this.lists[number], arrays = Object.entries(this.widths).map(([name, width]) => [name, taken(this.pool[name], width, rows)]);
+    const { neighbours, weights, template, points, normals, factors, limbs, opacities, albedo, roughness } = Object.fromEntries(arrays);
     const rest = new RestPose(rows.length, [neighbours, weights, template, points, factors, normals, limbs, this.surface.limits]);
-    const ofItsNodes = (values) => everyNth(values, this.nodes, this.share);
+    const kept = Int32Array.from({ length: Math.ceil(this.nodes / this.share) }, (_, k) => this.share * k);
+    const ofItsNodes = (values) => taken(values, values.length / this.nodes, kept);
     return { number, spacing: this.#spacing(number), cull: this.cull, rest, opacities, albedo, roughness, ofItsNodes };
   }
-}
-
-/** The rows 0, n, 2n … of `values`, which has `rows` of them. */
-function everyNth(values, rows, n) {
-  const width = values.length / rows, some = new Float32Array(width * Math.ceil(rows / n));
-  for (let row = 0, at = 0; row < rows; row += n, at += width) some.set(values.subarray(width * row, width * (row + 1)), at);
-  return some;
 }
 
 /** F · Fᵀ [9] of the factors of a row. */
@@ -121,11 +112,7 @@ const area = ([, middle, greatest]) => Math.sqrt(Math.max(middle * greatest, 0))
 /** Places [a, b] in `rows` of each pair that is merged. */
 function pairsOf(pool, rows) {
   const order = zCurve(pool.points, rows), count = rows.length;
-  const take = (values) => {
-    const taken = new Float64Array(3 * count);
-    order.forEach((place, i) => { for (let c = 0; c < 3; c++) taken[3 * i + c] = values[3 * rows[place] + c]; });
-    return taken;
-  };
+  const along = order.map((place) => rows[place]), take = (values) => Float64Array.from(taken(values, 3, along));
   const { partner, cost } = match(take(pool.points), take(pool.normals), take(pool.albedo), count), first = [];
   for (let i = 0; i < count; i++) if (partner[i] > i) first.push(i);
   first.sort((a, b) => cost[a] - cost[b]);  // stable
@@ -183,9 +170,4 @@ function match(points, normals, albedo, count) {
     cost[i] = cost[chosen] = best;
   }
   return { partner, cost };
-}
-
-function median(values) {
-  const sorted = values.slice().sort(), half = sorted.length >> 1;
-  return sorted.length % 2 ? sorted[half] : (sorted[half - 1] + sorted[half]) / 2;
 }

@@ -1,5 +1,6 @@
 // Separation of a light probe into sky and suns (rnd_runtime/shading/directional.py): sky + suns = map.
 
+import { median } from "../arrays.js";
 import { CAP, LAMP, LARGEST, MIN_SHARE, MAX_PEAKS, RING, RING_AREA } from "../constants.js";
 import { downsize, luminance, texelDirections, texelSolidAngles } from "./light.js";
 
@@ -74,9 +75,4 @@ function peakAround({ radiance, directions, angles, height, width }, centre) {
     sun = { direction: centre, irradiance, spread: Math.sqrt(Math.max(2 * (1 - length / weights), 0)) };
   }
   return { sun, sky };
-}
-
-function median(values) {
-  const sorted = Float64Array.from(values).sort(), half = sorted.length >> 1;
-  return sorted.length % 2 ? sorted[half] : (sorted[half - 1] + sorted[half]) / 2;
 }
