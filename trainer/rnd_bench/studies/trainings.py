@@ -15,6 +15,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from rnd_runtime.capture.capture import Capture, load_capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import earlier_rows, sha256_of, write_json
+from rnd_runtime.motion.motion import Motion
 from rnd_trainer.config import TrainConfig
 from rnd_trainer.evaluation.held_out import score
 from rnd_trainer.losses.perceptual import Perceptual, networks_by_role, networks_sha256
@@ -97,7 +98,8 @@ def ablate(
         if not found:
             run_folder = folder_of(folder, variant, seed)
             seen = _noisy(capture) if variant.noisy else capture
-            extra = _pose_errors(train(seen, config, run_folder, perceptual, consistency, on_share), capture)
+            training = train(seen, config, run_folder, perceptual, consistency, on_share)
+            extra = _pose_errors(training, seen.motion, capture)
             checkpoint = load_checkpoint(run_folder / "avatar.ckpt")
             scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=judge)
             extra |= encoder_cost(checkpoint.model) | _light_error(checkpoint, capture)
@@ -207,13 +209,13 @@ def train(
     return training
 
 
-def _pose_errors(training: Training, truth: Capture) -> dict[str, float]:
+def _pose_errors(training: Training, given: Motion, truth: Capture) -> dict[str, float]:
     """Errors of the poses before and after a training, degrees; empty where they were the true ones."""
-    if training.capture.motion.source == truth.motion.source:
+    if given.source == truth.motion.source:
         return {}
     frames = [view.frame.frame for view in training.views]
     return {
-        "pose_error_before_deg": joint_error_degrees(training.capture.motion, truth.motion, frames),
+        "pose_error_before_deg": joint_error_degrees(given, truth.motion, frames),
         "pose_error_after_deg": joint_error_degrees(training.motion(), truth.motion, frames),
     }
 

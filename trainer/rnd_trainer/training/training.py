@@ -26,6 +26,7 @@ from rnd_trainer.model.model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from rnd_trainer.model.template import sample_template
 
 from .data import TrainingView, load_views, pose_input
+from .jitter import without_jitter
 from .lighting import light_search
 from .lighting.grey_card import card_gain
 from .lighting.lights import KnownLight, TrainingLights, capture_lights, light_names
@@ -85,6 +86,8 @@ class Training:
         known: KnownLight | None = None,
     ) -> None:
         capture = capture.holding_out() if config.hold_out else capture
+        if config.refine_poses:
+            capture = dataclasses.replace(capture, motion=without_jitter(capture.motion))
         self.capture, self.config, self.schedule = capture, config, Schedule(config)
         torch.manual_seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -307,7 +310,7 @@ class Training:
         return self.schedule.stage(self.step_index)
 
     def motion(self) -> Motion:
-        """The capture's motion; with ``refine_poses`` its training frames are corrected."""
+        """The capture's motion; with ``refine_poses`` without jitter, and its training frames are corrected."""
         return self.capture.motion if self.refinement is None else self.refinement.apply_to(self.capture.motion)
 
     def pose(self, view: TrainingView, motion: Motion | None = None) -> PoseInput:
