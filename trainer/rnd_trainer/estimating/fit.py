@@ -17,7 +17,7 @@ from .fitting.figure import Figure, default_figure, known_figure
 from .fitting.kinematics import Posed
 from .fitting.marks import HAND_MARKS, KNUCKLES, Marks, marks_of
 from .fitting.normal_equations import NormalEquations
-from .fitting.pose_terms import GroundTerm, PriorTerm, SmoothTerm
+from .fitting.pose_terms import GroundTerm, PriorTerm, SmoothTerm, StillTerm
 from .fitting.prior import pose_prior
 from .fitting.silhouette import Outlines, OutlineTerm, Surface, outlines_of
 from .fitting.start import joint_rotations, local_rotations, root_positions
@@ -59,6 +59,7 @@ class Weights:
     smooth: float = 0.3  # factor of smoothness
     acceleration: float = 4.0  # deviation of the trunk's along each axis, m/s²; limbs two to three times that
     spin: float = 20.0  # deviation of the joints' angular acceleration, rad/s²; factors by joint as above
+    still: float = 1.0  # factor of joints that keep still
     outline: float = 0.5  # factor of the mask's outline against the body's
     inner: float = 0.15  # factor of body points that lie outside of the mask
     outline_m: float = 0.012  # deviation of outlines at the person's distance, m
@@ -192,6 +193,7 @@ class Fit:
         self.cost = np.inf
         self.state = self._start()
         self._smooth = self._smoothness()
+        self._still = StillTerm.of(self.times, self.state.rotations, weights.still)
 
     def _start(self) -> State:
         observations, figure = self.observations, self.figure
@@ -270,6 +272,7 @@ class Fit:
         cost += bones(state, posed, figure, layout, equations)
         cost += PriorTerm(pose_prior(), w.prior)(posed, layout, equations)
         cost += self._smooth(posed, layout, equations)
+        cost += self._still(posed, layout, equations)
         cost += GroundTerm(self.times, w.ground, w.slide)(state, posed, figure, marks, layout, equations)
         cost += SharedTerm(lens, 1 + w.shared * len(state.translations), self.height)(
             state, figure, marks, layout, equations

@@ -1,4 +1,4 @@
-"""The terms of poses by themselves: prior, hinges, smoothness in time, feet on the ground. See ``terms``."""
+"""The terms of poses by themselves: prior, hinges, smoothness in time, stillness, feet on the ground. See ``terms``."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from rnd_runtime.core.rotations import matrix_to_axis_angle
 from rnd_trainer.estimating.observations import FEET
@@ -19,6 +20,13 @@ from .state import Layout, State
 from .terms import marks_by_shape, robust
 
 Floats = NDArray[np.float64]
+
+AROUND_SECONDS = 2.0
+"""time over which a joint's usual rate is measured"""
+STILL_DRIFT = 0.013
+"""rad/√s, of a joint that keeps still"""
+STILL_RATE = 0.3
+"""rad/s; a joint that usually turns so fast drifts twice as far"""
 
 
 def right_jacobian_inverse(vectors: Floats) -> Floats:
@@ -103,7 +111,7 @@ class SmoothTerm:
         residual = factors[:, 0] * chain[0] + factors[:, 1] * chain[1] + factors[:, 2] * chain[2]
         cost, kept = robust((residual**2).sum(-1), self.limit)
         turned = posed.rotations[:, active]
-        steps = matrix_to_axis_angle(np.swapaxes(turned[:-1], -1, -2) @ turned[1:])  # [T − 1, A, 3]
+        steps = _steps(turned)  # [T − 1, A, 3]
         span = np.diff(self.times)[:, None, None]
         middle = (0.5 * (before + after))[:, None, None]
         rates = steps / span
@@ -136,14 +144,61 @@ class SmoothTerm:
             scale[..., None] * (late[..., None] * backward[1:] - early[..., None] * forward[:-1]),
             scale[..., None] * late[..., None] * forward[1:],
         ]
-        count, joints = spin.shape[:2]
-        parts = []
-        for block in blocks:
-            part = np.zeros((count, joints, 3, layout.unknowns))
-            for j in range(joints):
-                part[:, j, :, 3 * j : 3 * j + 3] = block[:, j]
-            parts.append(part.reshape(count, -1, layout.unknowns))
-        equations.add_chain(spin.reshape(count, -1), self.weight * np.repeat(kept, 3, axis=1), parts)
+        parts = [_of_each_joint(block, layout.unknowns) for block in blocks]
+        equations.add_chain(spin.reshape(len(spin), -1), self.weight * np.repeat(kept, 3, axis=1), parts)
+
+
+@dataclass(frozen=True, eq=False)
+class StillTerm:
+    """Joints that hardly turn keep still, so that a pose held while the person turns round is seen from all sides.
+
+    A random walk of each joint's local rotation, as wide as the lifter sees the joint move around that time; what
+    turns faster is left alone, and so is the root.
+
+    Attributes:
+        steps: [T − 1, J] rad, deviation of each joint's rotation from one frame to the next.
+    """
+
+    steps: Floats
+    weight: float = 1.0
+    limit: float = 2.0  # in deviations
+
+    @classmethod
+    def of(cls, times: Floats, rotations: Floats, weight: float) -> StillTerm:
+        """The term of local rotations [T, J, 3, 3] at ``times``, s."""
+        seconds = np.diff(times)
+        rates = np.linalg.norm(_steps(rotations), axis=-1) / seconds[:, None]
+        around = max(1, round(AROUND_SECONDS / float(np.median(seconds))))
+        usual = median_filter(rates, (around, 1), mode="nearest")
+        drift = STILL_DRIFT * (1 + (usual / STILL_RATE) ** 3)
+        return cls(drift * np.sqrt(seconds)[:, None], weight)
+
+    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> float:
+        active = layout.active
+        steps = _steps(posed.rotations[:, active])
+        scale = ((active != 0) / self.steps[:, active])[..., None]
+        residual = steps * scale
+        cost, kept = robust((residual**2).sum(-1), self.limit)
+        if equations is not None:
+            backward, forward = -right_jacobian_inverse(-steps), right_jacobian_inverse(steps)  # by δ(t), by δ(t + 1)
+            parts = [_of_each_joint(scale[..., None] * block, layout.unknowns) for block in (backward, forward)]
+            weight = self.weight * np.repeat(kept, 3, axis=1)
+            equations.add_chain(residual.reshape(len(residual), -1), weight, parts)
+        return self.weight * cost
+
+
+def _steps(rotations: Floats) -> Floats:
+    """Rotation vectors [T − 1, J, 3] from each of ``rotations`` [T, J, 3, 3] to the next, about its own axes."""
+    return matrix_to_axis_angle(np.swapaxes(rotations[:-1], -1, -2) @ rotations[1:])
+
+
+def _of_each_joint(blocks: Floats, unknowns: int) -> Floats:
+    """Derivatives [T, A·3, unknowns] of which each joint has its own rows, from ``blocks`` [T, A, 3, 3]."""
+    count, joints = blocks.shape[:2]
+    whole = np.zeros((count, joints, 3, unknowns))
+    for j in range(joints):
+        whole[:, j, :, 3 * j : 3 * j + 3] = blocks[:, j]
+    return whole.reshape(count, -1, unknowns)
 
 
 @dataclass(frozen=True, eq=False)
