@@ -24,7 +24,7 @@ from rnd_trainer.estimating.observing.frame_rate import Regular, regular
 from rnd_trainer.estimating.observing.observe import MIN_FRAMES
 from rnd_trainer.importing.options import FrameSelection, ImportOptions
 from rnd_trainer.importing.videos.video_file import VideoFile
-from rnd_trainer.training.uncertainty import load_uncertainty
+from rnd_trainer.training.poses.uncertainty import load_uncertainty
 from support.filmed_person import FPS, filmed_person
 from support.layouts import write_video
 from support.paths import SHARED

@@ -10,7 +10,7 @@ import pytest
 from rnd_runtime.motion.motion import Motion
 from rnd_trainer.evaluation.held_out_poses import fit_held_out
 from rnd_trainer.model.checkpoint import load_checkpoint
-from rnd_trainer.training.pose_refinement import joint_error_degrees
+from rnd_trainer.training.poses.refinement import joint_error_degrees
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from rnd_trainer.model.checkpoint import Checkpoint, load_checkpoint
 from rnd_trainer.model.model import AvatarModel
 from rnd_trainer.training.data import check_true_normals
 from rnd_trainer.training.lighting.lights import capture_lights
-from rnd_trainer.training.pose_refinement import joint_error_degrees
+from rnd_trainer.training.poses.refinement import joint_error_degrees
 from rnd_trainer.training.run import run
 from rnd_trainer.training.saving import resume_training
 from rnd_trainer.training.state import STATE_FILE, read_state

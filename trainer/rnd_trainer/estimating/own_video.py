@@ -28,7 +28,7 @@ from rnd_trainer.importing.surfaces.files import attach_files
 from rnd_trainer.importing.videos.undistorted import undistorted
 from rnd_trainer.importing.videos.video_file import VideoFile
 from rnd_trainer.importing.write import write_capture
-from rnd_trainer.training.uncertainty import PoseUncertainty, save_uncertainty
+from rnd_trainer.training.poses.uncertainty import PoseUncertainty, save_uncertainty
 
 from .film_notes import cut_off, film_notes, refuse_unusable
 from .fit import FOCAL_OF_SIDE, Estimate, estimate

@@ -17,8 +17,8 @@ from rnd_trainer.model.model import PosedGaussians, PoseInput
 from rnd_trainer.render.probe import LightProbes, Texels, sample_texels
 from rnd_trainer.render.render import Splat, shade_visible, splat
 from rnd_trainer.training.data import TrainingView, load_views, pose_input
-from rnd_trainer.training.pose_refinement import PoseRefinement
-from rnd_trainer.training.uncertainty import load_uncertainty
+from rnd_trainer.training.poses.refinement import PoseRefinement
+from rnd_trainer.training.poses.uncertainty import load_uncertainty
 
 STEPS = 40
 """of every frame"""

@@ -26,19 +26,19 @@ from rnd_trainer.model.model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from rnd_trainer.model.template import sample_template
 
 from .data import TrainingView, load_views, pose_input
-from .jitter import without_jitter
 from .lighting import light_search
 from .lighting.grey_card import card_gain
 from .lighting.lights import KnownLight, TrainingLights, capture_lights, light_names
 from .lighting.place import placed_light
 from .lighting.skin import TONES, skin_points
 from .objective import Objective
-from .pose_refinement import PoseRefinement
+from .poses.jitter import without_jitter
+from .poses.refinement import PoseRefinement
+from .poses.uncertainty import load_uncertainty
 from .sampled_poses import VELOCITY_NOISE_RATE, jittered_pose, perturbed_pose
 from .schedule import Schedule
 from .soap import Soap
 from .state import learned_sha256
-from .uncertainty import load_uncertainty
 from .unseen import UnseenPoses
 from .unseen_surface import evidence, fill_in
 

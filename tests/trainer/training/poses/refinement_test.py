@@ -12,7 +12,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion, load_motion
 from rnd_runtime.posing.forearm import skinning_bones
-from rnd_trainer.training.pose_refinement import (
+from rnd_trainer.training.poses.refinement import (
     DEVIATIONS,
     FADE_SECONDS,
     ROTATION_BOUND,
@@ -21,9 +21,9 @@ from rnd_trainer.training.pose_refinement import (
     TRANSLATION_LIMITS,
     PoseRefinement,
 )
+from rnd_trainer.training.poses.uncertainty import PoseUncertainty, load_uncertainty, save_uncertainty
 from rnd_trainer.training.saving import resume_training, save_training
 from rnd_trainer.training.training import Training
-from rnd_trainer.training.uncertainty import PoseUncertainty, load_uncertainty, save_uncertainty
 from support.tiny import body, motion
 
 FLOAT32 = 2e-6  # metres and matrix entries near 1, a chain of ten products

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from rnd_runtime.core.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rnd_runtime.motion.motion import Motion
-from rnd_trainer.training.jitter import without_jitter
+from rnd_trainer.training.poses.jitter import without_jitter
 
 FRAMES, JOINTS = 240, 3
 UNSMOOTHED = 0.02
