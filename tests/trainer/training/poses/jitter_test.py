@@ -72,9 +72,11 @@ def test_a_joint_at_rest_stays_beside_one_that_jitters() -> None:
     assert np.array_equal(without_jitter(given).rotations[:, 1], given.rotations[:, 1])
 
 
-def test_the_ends_and_short_motions_stay() -> None:
+def test_the_ends_and_short_or_slow_motions_stay() -> None:
     given = _disturbed(_swinging(), 1.0)
     ends = [0, 1, -2, -1]
     assert np.allclose(without_jitter(given).rotations[ends], given.rotations[ends], rtol=0, atol=1e-12)
     short = dataclasses.replace(given, rotations=given.rotations[:20], translations=given.translations[:20])
     assert without_jitter(short) is short
+    slow = dataclasses.replace(given, fps=15.0)
+    assert without_jitter(slow) is slow

@@ -22,16 +22,18 @@ REACHES = (2, 3, 4, 5, 6, 7, 8, 10)
 """frames on each side that a polynomial spans"""
 DEGREE = 3
 DIFFERENCES = 6
+SLOWEST_FPS = 24.0
+"""below which people's own motion differs as much from frame to frame"""
 AROUND_SECONDS = 4.0
 """time over which a width's risk is averaged"""
 _MEDIAN = 0.6745  # of the absolute value of a standard normal variable
 
 
 def without_jitter(motion: Motion) -> Motion:
-    """``motion`` smoothed as far as each joint jitters; the first and last two frames stay as they are."""
+    """``motion`` smoothed as far as each joint jitters; its ends stay, and so do slow and short ones as a whole."""
     reach = max(REACHES)
     count = motion.frame_count
-    if count <= 2 * reach:
+    if count <= 2 * reach or motion.fps < SLOWEST_FPS:
         return motion
     shifted = np.clip(np.arange(count)[:, None] + np.arange(-reach, reach + 1), 0, count - 1)  # [T, 2·reach + 1]
     around = round(AROUND_SECONDS * motion.fps)
