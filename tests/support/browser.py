@@ -21,6 +21,10 @@ CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 PATIENCE = 60  # s; two cores may be busy with other things
 
 
+class LeftPage(AssertionError):
+    """The tab went to another page before it answered."""
+
+
 class Page:
     """One tab."""
 
@@ -38,6 +42,8 @@ class Page:
         while True:
             message = json.loads(self._socket.recv(timeout=PATIENCE))
             if message.get("id") == number:
+                if "navigated" in message.get("error", {}).get("message", ""):
+                    raise LeftPage(message)
                 assert "error" not in message, message
                 return message["result"]
             self._note(message)
@@ -63,9 +69,15 @@ class Page:
     def wait(self, condition: str) -> None:
         """Until the JavaScript ``condition`` holds."""
         until = time.monotonic() + PATIENCE
-        while not self.run(f"Boolean({condition})"):
+        while not self._holds(condition):
             assert time.monotonic() < until, (condition, self.messages)
             time.sleep(0.05)
+
+    def _holds(self, condition: str) -> bool:
+        try:
+            return bool(self.run(f"Boolean({condition})"))
+        except LeftPage:
+            return False
 
     def screenshot(self, path: Path) -> None:
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot")["data"]))
