@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
+from scipy.signal import savgol_coeffs
 
 from rnd_runtime.core.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rnd_runtime.motion.motion import Motion
@@ -49,11 +50,10 @@ def without_jitter(motion: Motion) -> Motion:
 def _correction(nearby: Floats, around: int) -> Floats:
     """Corrections [T, 3] of least risk, from the frames ``nearby`` [T, 2·reach + 1, 3] each, relative to it."""
     count, middle = len(nearby), nearby.shape[1] // 2
-    noise = _noise(nearby[middle:-middle, middle - DIFFERENCES // 2 :])
+    noise = _noise(nearby[middle:-middle, middle - DIFFERENCES // 2 : middle + DIFFERENCES // 2 + 1])
     corrections, risks = [np.zeros((count, 3))], [np.zeros(count)]
     for reach in REACHES:
-        powers = np.vander(np.arange(-reach, reach + 1.0), DEGREE + 1, increasing=True)
-        weights = np.linalg.pinv(powers)[0]  # of the polynomial's value in the middle
+        weights = savgol_coeffs(2 * reach + 1, DEGREE)  # of the polynomial's value in the middle
         inside = slice(reach, count - reach)
         correction, risk = np.zeros((count, 3)), np.full(count, np.inf)
         correction[inside] = np.einsum("k,tkc->tc", weights, nearby[inside, middle - reach : middle + reach + 1])
@@ -67,6 +67,5 @@ def _correction(nearby: Floats, around: int) -> Floats:
 
 def _noise(nearby: Floats) -> float:
     """Variance of each axis of what differs from frame to frame."""
-    signs = np.array([(-1) ** k * math.comb(DIFFERENCES, k) for k in range(DIFFERENCES + 1)])
-    differences = np.einsum("k,tkc->tc", signs, nearby[:, : DIFFERENCES + 1])
-    return float((np.median(np.abs(differences)) / _MEDIAN) ** 2 / (signs**2).sum())
+    differences = np.diff(nearby, DIFFERENCES, axis=1)
+    return float((np.median(np.abs(differences)) / _MEDIAN) ** 2 / math.comb(2 * DIFFERENCES, DIFFERENCES))
