@@ -21,7 +21,7 @@ METRICS_FILE, STATUS_FILE = "metrics.jsonl", "status.json"
 """in a run's folder: one row per step; current progress"""
 PHASES = {1: "geometry", 2: "albedo and light", 3: "unseen poses"}
 """names of the stages"""
-WARM_UP, LIGHT_SEARCH = "warming up", "searching the light"
+WARM_UP = "warming up"
 STATUS_S = 1.0
 """seconds between two writes of the status"""
 RECENT = 200
@@ -42,7 +42,7 @@ def run(
 
     Args:
         folder: for ``metrics.jsonl``, ``status.json``, states and checkpoint.
-        on_phase: called with name, done and total when a phase begins, and during the light search.
+        on_phase: called with name, done and total when a phase begins, and during searches.
 
     Returns:
         Whether a signal stopped the training.
@@ -55,10 +55,10 @@ def run(
         status.write(name)
         on_phase(name, done, of)
 
-    def search(done: int, of: int) -> None:
+    def search(name: str, done: float, of: float) -> None:
         nonlocal stage
         stage = 0  # the stage's phase begins afterwards
-        begin(LIGHT_SEARCH, done, of)
+        begin(name, done, of)
 
     def interrupt() -> None:
         nonlocal interrupted
@@ -68,7 +68,7 @@ def run(
         with suppress(OSError, InputError):  # e.g. of a full disk
             status.end("stopped")
 
-    training.on_light_search = search
+    training.on_search = search
     try:
         with at_end(stop):
             if training.step_index < config.steps:

@@ -8,6 +8,8 @@ from rnd_trainer.config import TrainConfig
 
 UNSEEN_COST = 1 / 8
 """cost of a step without an image relative to one with an image (25 of 200 ms)"""
+POSE_FITS = (0.3, 0.55, 0.8)
+"""shares of the steps before which all poses are fitted to the avatar"""
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,10 @@ class Schedule:
     def refines(self, step: int) -> bool:
         """Whether ``step`` corrects body poses."""
         return step >= self.config.refine_after * self.config.steps
+
+    def fits_poses(self, step: int) -> bool:
+        """Whether all poses of a film are fitted to the avatar before ``step``."""
+        return step in [round(share * self.config.steps) for share in POSE_FITS]
 
     def cost(self, steps: int) -> float:
         """Cost of the first ``steps`` in steps with an image, the unit of progress."""

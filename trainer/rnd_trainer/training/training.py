@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ from .lighting.skin import TONES, skin_points
 from .objective import Objective
 from .poses.jitter import without_jitter
 from .poses.refinement import PoseRefinement
+from .poses.render_and_compare import SCALE, Compared, Search, fit_pose, frozen
 from .poses.uncertainty import load_uncertainty
 from .sampled_poses import VELOCITY_NOISE_RATE, jittered_pose, perturbed_pose
 from .schedule import Schedule
@@ -48,6 +49,11 @@ MAX_BAD_STEPS = 10
 """consecutive non-finite steps after which training stops"""
 PERTURBED_SHARE = 0.5
 """share of the distillation steps in a perturbed training pose; the rest use the training pose"""
+
+LIGHT_SEARCH, POSE_FIT = "searching the light", "fitting poses to the avatar"
+"""names of what takes longer than a step"""
+SEARCH = Search(steps=20, rate=1e-2, cools=True, root_moves=False)
+"""of every pose at each of the schedule's fits; a root that moves drifts away with the avatar"""
 
 
 @dataclass
@@ -72,7 +78,7 @@ class Training:
         device: of the tensors; random numbers come from the CPU on every device.
 
     Attributes:
-        on_light_search: called with done and total during the light search.
+        on_search: called with a phase's name, done and total during the light search and fits of poses.
     """
 
     def __init__(
@@ -118,11 +124,13 @@ class Training:
             self._card_pixel = self.known.card.pixel(view, capture.cameras[view.frame.camera])
         self.lights.to(self.device)
         self.refinement: PoseRefinement | None = None
+        self.estimated = False  # whether the poses come with their uncertainty
         if config.refine_poses:
             frames = [view.frame.frame for view in self.views]
             motion, skeleton = capture.motion, capture.body.skeleton
             unsure = load_uncertainty(capture.folder, motion.frame_count, len(skeleton))
             self.refinement = PoseRefinement(motion, skeleton, frames, unsure).to(self.device)
+            self.estimated = unsure is not None
 
         # objectives: of an image, and from the third stage on of unseen poses
         self.objective = Objective(config, self.lights, self.perceptual, self.consistency, self.generator)
@@ -150,7 +158,7 @@ class Training:
         self.lit = False  # whether the second stage has begun
         self.light_found: bool | None = None  # result of the light search, once done
         self.seconds = 0.0
-        self.on_light_search: Callable[[int, int], None] = lambda done, total: None
+        self.on_search: Callable[[str, int, int], None] = lambda name, done, total: None
 
     def _placed(self, network: Perceptual) -> Perceptual:
         return network.in_bfloat16() if self.device.type == "cpu" else network.to(device=self.device)
@@ -178,6 +186,8 @@ class Training:
         """Optimise on the next view. Raises ``InputError`` after ``MAX_BAD_STEPS`` non-finite steps in a row."""
         started = time.perf_counter()
         self._start_second_stage()
+        if self.estimated and self.schedule.fits_poses(self.step_index):
+            self._fit_poses()
         stage = self.stage
         for group in self._groups:
             group["lr"] = group["start_rate"] * self.schedule.decay(self.step_index)
@@ -251,6 +261,32 @@ class Training:
             pose = perturbed_pose(motion, skeleton, time_s, self.config.model, rng).to(self.device)
         return self.unseen(self.model, pose, self.step_index)
 
+    # -- fits of poses -------------------------------------------------------------------------------------
+
+    def _fit_poses(self) -> None:
+        """Correct the poses of all images until the avatar as it is looks like them; it learns from these."""
+        assert self.refinement is not None
+        radiance, probes = self.lights.radiance().detach(), self.lights.probes
+        generator = torch.Generator().manual_seed(self.config.seed + self.step_index)
+        with frozen(self.model):
+            for done, (frame, views) in enumerate(self._small_views.items()):
+                self.on_search(POSE_FIT, done, len(self._small_views))
+                lights = [radiance[self.lights.index(view.frame)] for view in views]
+                maps = [
+                    (light, probes.directions, probes.solid_angles) if self.stage == 2 else None for light in lights
+                ]
+                images = [Compared(view, light) for view, light in zip(views, maps)]
+                pose = next(pose for view, pose in zip(self.views, self.poses) if view.frame.frame == frame)
+                fit_pose(self.model, self.config, self.refinement, pose, images, SEARCH, generator)
+
+    @cached_property
+    def _small_views(self) -> dict[int, list[TrainingView]]:
+        """The training images by frame, at the scale of render-and-compare."""
+        views: dict[int, list[TrainingView]] = {}
+        for view in load_views(self.capture, "train", SCALE * self.config.image_scale)[0]:
+            views.setdefault(view.frame.frame, []).append(view)
+        return views
+
     # -- the second stage ----------------------------------------------------------------------------------
 
     def _start_second_stage(self) -> None:
@@ -268,15 +304,16 @@ class Training:
         images = self.model, self.views, poses
         hints = self._skin, None if self.config.skin is None else TONES[self.config.skin - 1]
         place, card, probes = self.known.place, self.known.card, self.lights.probes
+        on_step = partial(self.on_search, LIGHT_SEARCH)
         if place is not None:
-            radiance = placed_light(*images, place, self.on_light_search, *hints)
+            radiance = placed_light(*images, place, on_step, *hints)
             self.light_found = radiance is not None
             probes.raw.requires_grad_(radiance is None)  # where it was not found, it is learned from white
             if radiance is not None:
                 probes.start_from(torch.from_numpy(radiance)[None], probes.exposure)
         else:
             lights = [self.lights.index(view.frame) for view in self.views]
-            found = light_search.initial_light(*images, lights, self.on_light_search, *hints)
+            found = light_search.initial_light(*images, lights, on_step, *hints)
             self.light_found = found is not None
             if found is not None:
                 probes.start_from(torch.from_numpy(found.radiance), torch.from_numpy(found.exposure))
