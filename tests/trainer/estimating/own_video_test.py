@@ -16,6 +16,7 @@ import pytest
 from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import read_image
+from rnd_runtime.motion.motion import load_motion
 from rnd_trainer.checking.silhouette import mask_iou
 from rnd_trainer.commands import train as train_cli
 from rnd_trainer.estimating import own_video
@@ -25,6 +26,7 @@ from rnd_trainer.estimating.observing.observe import MIN_FRAMES
 from rnd_trainer.importing.options import FrameSelection, ImportOptions
 from rnd_trainer.importing.videos.video_file import VideoFile
 from rnd_trainer.training.poses.uncertainty import load_uncertainty
+from rnd_trainer.training.saving import REFINED_MOTION
 from support.filmed_person import FPS, filmed_person
 from support.layouts import write_video
 from support.paths import SHARED
@@ -56,6 +58,8 @@ def test_a_video_becomes_a_capture_and_trains(film: Path, tmp_path: Path, capsys
     with av.open(str(out / "capture" / "check" / "overlay.mp4")) as overlay:
         assert sum(1 for _ in overlay.decode(video=0)) == FRAMES
     assert (out / "avatar.ckpt").is_file()
+    moves, refined = capture.motion, load_motion(out / REFINED_MOTION, capture.body.skeleton)
+    assert np.abs(refined.rotations - moves.rotations).max() > 1e-3  # its poses were fitted to the avatar
 
 
 def test_missing_networks_and_short_clips_leave_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

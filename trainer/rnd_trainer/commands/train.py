@@ -110,6 +110,7 @@ def _train(options: TrainOptions) -> None:
     from rnd_trainer.config import to_dict
     from rnd_trainer.losses.perceptual import load_features, load_lpips
     from rnd_trainer.training.notes import capture_notes
+    from rnd_trainer.training.poses.uncertainty import FILE as UNCERTAINTY_FILE
     from rnd_trainer.training.saving import resume_training
     from rnd_trainer.training.state import STATE_FILE
     from rnd_trainer.training.training import Training
@@ -118,6 +119,8 @@ def _train(options: TrainOptions) -> None:
     folder = options.out
     options = dataclasses.replace(options, capture=_capture_folder(options.capture, folder))
     capture = load_capture(options.capture, motion_file=learning.motion)
+    if learning.motion is None and (capture.folder / UNCERTAINTY_FILE).is_file():
+        config = dataclasses.replace(config, refine_poses=True)
     log_all(capture_notes(capture, ["train"] if config.light == "capture" else []))
     known = _known_light(options)
     if device == "cpu" and kernels_are_cold(_KERNELS):
@@ -283,7 +286,7 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
 
 
 def _score_after_training(training: Training, folder: Path, options: TrainOptions) -> None:
-    """Score the held-out splits in the training's poses, refined if ``--refine-poses``."""
+    """Score the held-out splits in the training's poses, refined if it refines them."""
     from rnd_trainer.evaluation.evaluate import scored_splits
     from rnd_trainer.training.saving import REFINED_MOTION
 
@@ -295,6 +298,6 @@ def _score_after_training(training: Training, folder: Path, options: TrainOption
             json=folder / "eval.json",
             strips=folder / "eval",
             perceptual_weights=learning.perceptual_weights,
-            motion=str((folder / REFINED_MOTION).resolve()) if learning.refine_poses else learning.motion,
+            motion=str((folder / REFINED_MOTION).resolve()) if training.config.refine_poses else learning.motion,
         )
         evaluate_run(scoring)

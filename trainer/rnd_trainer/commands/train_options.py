@@ -51,7 +51,7 @@ class Learning:
     grey_card: Annotated[str | None, option("FRAME:X,Y")] = None
     """A pixel of a training image that shows an 18 % grey card: fixes colour and level of the light."""
     refine_poses: Flag = False
-    """Correct the capture's body poses while training; writes refined_motion.npz."""
+    """Correct the capture's body poses while training, as always those of a video; writes refined_motion.npz."""
     motion: Annotated[str | None, option("FILE")] = None
     """Another motion file of the capture."""
 

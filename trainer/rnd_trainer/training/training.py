@@ -124,13 +124,13 @@ class Training:
             self._card_pixel = self.known.card.pixel(view, capture.cameras[view.frame.camera])
         self.lights.to(self.device)
         self.refinement: PoseRefinement | None = None
-        self.estimated = False  # whether the poses come with their uncertainty
+        self.fits_poses = False  # between steps, as those of a video, instead of in every step
         if config.refine_poses:
             frames = [view.frame.frame for view in self.views]
             motion, skeleton = capture.motion, capture.body.skeleton
             unsure = load_uncertainty(capture.folder, motion.frame_count, len(skeleton))
             self.refinement = PoseRefinement(motion, skeleton, frames, unsure).to(self.device)
-            self.estimated = unsure is not None
+            self.fits_poses = unsure is not None
 
         # objectives: of an image, and from the third stage on of unseen poses
         self.objective = Objective(config, self.lights, self.perceptual, self.consistency, self.generator)
@@ -145,7 +145,7 @@ class Training:
             (residuals, config.rate_residuals),
             ([self.lights.probes.raw], config.rate_light),
         ]
-        if self.refinement is not None:
+        if self.refinement is not None and not self.fits_poses:
             rates.append((list(self.refinement.raw), config.rate_poses))
         self.optimizers = {
             "adam": torch.optim.Adam(_with_rates(rates), config.rate_networks, BETAS, eps=1e-15),
@@ -186,7 +186,7 @@ class Training:
         """Optimise on the next view. Raises ``InputError`` after ``MAX_BAD_STEPS`` non-finite steps in a row."""
         started = time.perf_counter()
         self._start_second_stage()
-        if self.estimated and self.schedule.fits_poses(self.step_index):
+        if self.fits_poses and self.schedule.fits_poses(self.step_index):
             self._fit_poses()
         stage = self.stage
         for group in self._groups:
@@ -240,12 +240,13 @@ class Training:
     def _image_terms(self, view: TrainingView, pose: PoseInput, stage: int) -> dict[str, Tensor]:
         """Loss terms of the first and second stage."""
         frame = view.frame.frame
-        refinement = self.refinement if self.schedule.refines(self.step_index) else None
-        if refinement is not None:
-            pose = dataclasses.replace(pose, bones=refinement.bones(frame))
+        corrected = self.refinement if self.fits_poses or self.schedule.refines(self.step_index) else None
+        if corrected is not None:
+            bones = corrected.bones(frame)
+            pose = dataclasses.replace(pose, bones=bones.detach() if self.fits_poses else bones)
         terms = self.objective(self.model, view, pose, self.step_index, stage)
-        if refinement is not None:
-            terms["poses"] = self.config.weight_poses * refinement.prior(frame)
+        if corrected is not None and not self.fits_poses:
+            terms["poses"] = self.config.weight_poses * corrected.prior(frame)
         return terms
 
     def _unseen_terms(self, view: TrainingView, pose: PoseInput) -> dict[str, Tensor]:

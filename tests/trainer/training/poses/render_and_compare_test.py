@@ -39,7 +39,7 @@ def test_a_films_wrong_poses_come_nearer_by_its_fits_alone(film, tiny_config) ->
 
     noise = np.radians(3) * np.random.default_rng(0).standard_normal((truth.frame_count, len(skeleton), 3))
     bad = Motion(truth.rotations @ axis_angle_to_matrix(noise), truth.translations, truth.fps, truth.joint_names)
-    config = dataclasses.replace(tiny_config, steps=150, refine_poses=True, light="none", refine_after=1.0)
+    config = dataclasses.replace(tiny_config, steps=150, refine_poses=True, light="none")
     training = Training(dataclasses.replace(film, motion=bad), config)
     for _ in range(config.steps):
         training.step()
@@ -47,7 +47,7 @@ def test_a_films_wrong_poses_come_nearer_by_its_fits_alone(film, tiny_config) ->
 
 
 def test_a_films_poses_are_fitted_between_steps_and_others_are_not(film, tiny_capture, tiny_config) -> None:
-    config = dataclasses.replace(tiny_config, refine_poses=True, refine_after=1.0)  # nothing else corrects them
+    config = dataclasses.replace(tiny_config, refine_poses=True, refine_after=1.0)  # others are corrected later
     for capture, fitted in ((film, True), (tiny_capture, False)):
         training, searched = Training(capture, config), []
         training.on_search = lambda name, done, total, names=searched: names.append(name)
