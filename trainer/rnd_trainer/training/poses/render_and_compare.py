@@ -13,7 +13,7 @@ from rnd_trainer.config import TrainConfig
 from rnd_trainer.losses.losses import image_loss, linear_to_srgb
 from rnd_trainer.model.model import AvatarModel, PosedGaussians, PoseInput
 from rnd_trainer.render.probe import sample_texels
-from rnd_trainer.render.render import Splat, shade_visible, splat
+from rnd_trainer.render.render import shade_visible, splat
 from rnd_trainer.training.data import TrainingView
 
 from .refinement import PoseRefinement
@@ -100,22 +100,11 @@ def _difference(
 ) -> Tensor:
     """Loss of one image on black: as in training, without the terms of the model alone."""
     view, device = image.view, posed.means.device
-    rendered = _rendered(model, config, posed, pose, image, generator)
+    radiance = posed.attributes.colour
+    if image.light is not None:
+        texels = sample_texels(*image.light, config.light_texels, generator)
+        radiance = shade_visible(posed, pose, texels, view.camera, model, config.traced_texels)
+    rendered = splat(posed, radiance, view.camera)
     target, mask = (x.to(device) for x in view.target(torch.zeros(3)))
     loss = image_loss(linear_to_srgb(rendered.image), linear_to_srgb(target), config.weight_dssim, config.dssim_scales)
     return loss + config.weight_mask * (rendered.alpha - mask).abs().mean()
-
-
-def _rendered(
-    model: AvatarModel,
-    config: TrainConfig,
-    posed: PosedGaussians,
-    pose: PoseInput,
-    image: Compared,
-    generator: torch.Generator,
-) -> Splat:
-    camera = image.view.camera
-    if image.light is None:
-        return splat(posed, posed.attributes.colour, camera)
-    texels = sample_texels(*image.light, config.light_texels, generator)
-    return splat(posed, shade_visible(posed, pose, texels, camera, model, config.traced_texels), camera)
