@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from rnd_runtime.capture.body import posed_vertices
 from rnd_runtime.core.errors import InputError
@@ -17,8 +18,10 @@ from rnd_trainer.estimating.fitting.kinematics import attached, pose
 from rnd_trainer.estimating.fitting.marks import marks_of
 from rnd_trainer.estimating.fitting.normal_equations import NormalEquations
 from rnd_trainer.estimating.fitting.state import TO_CAMERA
+from rnd_trainer.estimating.fitting.surface import Surface
 from rnd_trainer.estimating.lifted import JOINTS, PARENTS, REST_DIRECTIONS, ROLL_AXES, Lifted
 from rnd_trainer.estimating.observations import Masks, Observations
+from rnd_trainer.estimating.flow import Flow, flow_of
 
 FRAMES, SIZE, FOCAL, FPS = 16, 200, 260.0, 15.0
 HANGING = 0.8
@@ -52,14 +55,19 @@ def known_person(noise_px: float = 0.7, seed: int = 0, *, held: bool = False):
     points = attached(posed, marks.joints, places)[:, :33] @ TO_CAMERA
     pixels = FOCAL * points[..., :2] / points[..., 2:] + SIZE / 2
     rng = np.random.default_rng(seed)
-    masks = []
+    masks, images = [], []
+    patches = np.unique(np.floor(body.vertices[body.faces[:, 0]] / 0.05), axis=0, return_inverse=True)[1].ravel()
+    paint = np.random.default_rng(5).integers(40, 256, (patches.max() + 1, 3))[patches].tolist()
     for frame in range(FRAMES):
         vertices = posed_vertices(body, rotations[frame], translations[frame]) @ TO_CAMERA
         flat = FOCAL * vertices[:, :2] / vertices[:, 2:] + SIZE / 2
-        mask = np.zeros((SIZE, SIZE), np.uint8)
-        for triangle in (flat[body.faces] * 16).astype(np.int32):
-            cv2.fillConvexPoly(mask, triangle, 255, shift=4)
-        masks.append(mask)
+        image = np.zeros((4 * SIZE, 4 * SIZE, 3), np.uint8)
+        triangles = (flat[body.faces] * 4 * 16).astype(np.int32)
+        for k in np.argsort(-vertices[body.faces, 2].mean(1)):
+            cv2.fillConvexPoly(image, triangles[k], paint[k], shift=4)
+        image = cv2.resize(image, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
+        masks.append(np.where(image.max(-1) > 20, 255, 0).astype(np.uint8))
+        images.append(image)
     hint = points - points[:, 23:25].mean(1, keepdims=True)
     index = [names.index(name) for name in JOINTS]
     world = TO_CAMERA @ posed.world[:, index]
@@ -86,6 +94,7 @@ def known_person(noise_px: float = 0.7, seed: int = 0, *, held: bool = False):
         np.full((FRAMES, 2, 21, 2), np.nan, np.float32),
         np.zeros((FRAMES, 2), np.float32),
         Masks.of(masks, (SIZE, SIZE)),
+        flow_of(images.__getitem__, masks),
     )
     return observations, lifted, posed.joints @ TO_CAMERA, body
 
@@ -136,7 +145,7 @@ def test_it_recovers_a_known_motion(person):
 @pytest.mark.slow
 def test_a_pose_that_is_held_is_seen_from_all_sides():
     observations, lifted, truth, body = known_person(held=True)
-    observations = replace(observations, fps=5.0)  # half a turn in three seconds
+    observations = replace(observations, fps=5.0, flow=None)  # half a turn in three seconds
     arms = [body.skeleton.names.index(f"{side}_{name}") for side in ("left", "right") for name in ("elbow", "wrist")]
     from_the_side = np.abs(np.linspace(-1, 1, FRAMES)) < 0.4
     errors = []
@@ -148,19 +157,47 @@ def test_a_pose_that_is_held_is_seen_from_all_sides():
     assert errors[1] < 0.5 * errors[0]
 
 
-@pytest.mark.parametrize("part", ["pose", "root", "shape", "offsets", "focal"])
-@pytest.mark.parametrize("outlines", [False, True])
-def test_derivatives_agree_with_differences(person, part, outlines):
+@pytest.mark.slow
+def test_flow_mends_what_is_wrong_for_a_while():
+    observations, lifted, truth, body = known_person()
+    rng = np.random.default_rng(4)
+    astray = gaussian_filter1d(rng.normal(size=(FRAMES, 33, 2)), 2, axis=0)
+    pixels = (observations.keypoints_px + 6 * astray).astype(np.float32)
+    lean = axis_angle_to_matrix(0.5 * gaussian_filter1d(rng.normal(size=(FRAMES, 21, 3)), 2, axis=0))
+    directions, roll = (
+        np.einsum("tpij,tpj->tpi", lean, v).astype(np.float32) for v in (lifted.directions, lifted.roll)
+    )
+    lifted = replace(lifted, directions=directions, roll=roll)
+    errors = []
+    for flow in (None, observations.flow):
+        seen = replace(observations, keypoints_px=pixels, flow=flow)
+        found = camera_joints(estimate(seen, lifted, body=body, focal_px=FOCAL))
+        errors.append(np.linalg.norm((found - found[:, :1]) - (truth - truth[:, :1]), axis=-1).mean())
+    assert errors[1] < 0.8 * errors[0], errors
+
+
+@pytest.mark.parametrize(
+    ("term", "part"),
+    [(term, part) for term in ("points", "outlines") for part in ("pose", "root", "shape", "offsets", "focal")]
+    + [("flow", "pose"), ("flow", "root")],  # flow and smoothness count a pose's part alone
+)
+def test_derivatives_agree_with_differences(person, term, part):
     few, lifted = person[0].select(np.arange(4)), parts_of(person[1], 4)
-    weights = replace(Weights(), smooth=0.0) if part == "shape" else Weights()  # smoothness counts a pose's part alone
-    if outlines:
+    weights = replace(Weights(), smooth=0.0) if part == "shape" else Weights()
+    if term != "points":
         weights = replace(Weights(), points=0, bones=0, prior=0, smooth=0, still=0, shared=0)
     fit = Fit(few, lifted, default_figure(), _lens(few, 240.0, None), 1.7, replace(weights, ground=0.0, slide=0.0))
-    points, outline = fit._point_term(Stage(1)), None
-    if outlines:  # wide limits: the weights of far matches are constants of a step
+    points, outline, flow = fit._point_term(Stage(1)), None, None
+    if term == "outlines":  # wide limits: the weights of far matches are constants of a step
         outline = replace(fit._outline_term(), inner_weight=0.0, limit=1e4)
+    if term == "flow":
+        flow_before = person[0].flow
+        fit.observations = replace(few, flow=Flow(flow_before.boxes[:3], flow_before.displacement[:3]))
+        fit.surface = Surface(fit.figure)
+        flow = fit._flow_term()
+        assert (flow.inverse > 0).sum(1).min() > 20
     equations = NormalEquations(4, fit.layout.unknowns, fit.layout.shared)
-    fit.evaluate(fit.state, points, outline, equations)
+    fit.evaluate(fit.state, points, outline, flow, equations)
     rng = np.random.default_rng(0)
     local, shared = np.zeros((4, fit.layout.unknowns)), np.zeros(fit.layout.shared)
     if part == "pose":
@@ -172,7 +209,7 @@ def test_derivatives_agree_with_differences(person, part, outlines):
         shared[here] = rng.normal(size=shared[here].shape)
     small = 1e-5
     ahead, behind = (
-        fit.evaluate(fit.layout.moved(fit.state, s * local, s * shared), points, outline) for s in (small, -small)
+        fit.evaluate(fit.layout.moved(fit.state, s * local, s * shared), points, outline, flow) for s in (small, -small)
     )
     slope = 2 * ((equations.gradient * local).sum() + equations.shared_gradient @ shared)
     assert (ahead - behind) / (2 * small) == pytest.approx(slope, rel=1e-3, abs=0.05)

@@ -14,14 +14,16 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import Motion
 
 from .fitting.figure import Figure, default_figure, known_figure
+from .fitting.image_motion import FlowTerm
 from .fitting.kinematics import Posed
 from .fitting.marks import HAND_MARKS, KNUCKLES, Marks, marks_of
 from .fitting.normal_equations import NormalEquations
 from .fitting.pose_terms import GroundTerm, PriorTerm, SmoothTerm, StillTerm
 from .fitting.prior import pose_prior
-from .fitting.silhouette import Outlines, OutlineTerm, Surface, outlines_of
+from .fitting.silhouette import Outlines, OutlineTerm, outlines_of, rim_matches
 from .fitting.start import joint_rotations, local_rotations, root_positions
 from .fitting.state import TO_CAMERA, Layout, State
+from .fitting.surface import Surface
 from .fitting.terms import BoneTerm, Lens, PointTerm, SharedTerm, mark_points, project
 from .lifted import Lifted
 from .lifter import lift
@@ -52,17 +54,18 @@ class Weights:
     mark_m: float = 0.022  # deviation of a sure landmark at the person's distance, m
     spread: float = 1.0  # share of the distance between one frame's views that counts as deviation
     points: float = 2.0  # factor of the landmarks
-    bones: float = 0.45  # factor of the lifter's directions
+    bones: float = 0.2  # factor of the lifter's directions
     limbs: float = 0.105  # deviation of its limbs and rolls from the body's, beside its own, rad
     trunk: float = 0.21  # likewise of its trunk; rigs differ, rad
     prior: float = 0.03  # factor of the prior of poses
-    smooth: float = 0.3  # factor of smoothness
+    smooth: float = 0.1  # factor of smoothness
     acceleration: float = 4.0  # deviation of the trunk's along each axis, m/s²; limbs two to three times that
     spin: float = 20.0  # deviation of the joints' angular acceleration, rad/s²; factors by joint as above
     still: float = 1.0  # factor of joints that keep still
     outline: float = 0.5  # factor of the mask's outline against the body's
     inner: float = 0.15  # factor of body points that lie outside of the mask
     outline_m: float = 0.012  # deviation of outlines at the person's distance, m
+    flow: float = 0.5  # factor of the surface's motion in the image
     ground: float = 1.0  # factor of feet on the ground
     slide: float = 0.03  # factor of standing feet that move
     shared: float = 0.1  # share of the frames that count as independent, in the weight of shape and focal length
@@ -73,14 +76,14 @@ class Stage:
     """Steps of the fit with some terms."""
 
     steps: int
-    outlines: bool = False
+    surface: bool = False  # the terms of outlines and flow
     points: float = 1.0
     limit: float = 3.0
 
 
 CONVERGED = 1e-3
 """relative fall of the cost below which a stage ends"""
-STAGES = (Stage(8, points=0.3, limit=8.0), Stage(10, limit=5.0), Stage(14, outlines=True))
+STAGES = (Stage(8, points=0.3, limit=8.0), Stage(10, limit=5.0), Stage(14, surface=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,12 +260,24 @@ class Fit:
             self.outlines = outlines_of(self.observations.masks, len(self.observations), self.observations.image_size)
             self.surface = Surface(self.figure)
         posed = self.state.posed(self.figure)
-        matches = self.surface.matches(self.state, posed, self.lens, self.outlines)
+        matches = rim_matches(self.surface, self.state, posed, self.lens, self.outlines)
         deviation = self.weights.outline_m * self._scale()
         return OutlineTerm(self.surface, self.outlines, matches, deviation, self.weights.outline, self.weights.inner)
 
+    def _flow_term(self) -> FlowTerm | None:
+        flow = self.observations.flow
+        if flow is None or self.surface is None:
+            return None
+        posed = self.state.posed(self.figure)
+        return FlowTerm.of(self.surface, self.state, posed, self.lens, flow, self._scale(), self.weights.flow)
+
     def evaluate(
-        self, state: State, points: PointTerm, outline: OutlineTerm | None, equations: NormalEquations | None = None
+        self,
+        state: State,
+        points: PointTerm,
+        outline: OutlineTerm | None,
+        flow: FlowTerm | None = None,
+        equations: NormalEquations | None = None,
     ) -> float:
         """Cost of ``state``; adds its derivatives to ``equations``."""
         figure, marks, layout, lens, w = self.figure, self.marks, self.layout, self.lens, self.weights
@@ -279,20 +294,23 @@ class Fit:
         )
         if outline is not None:
             cost += outline(state, posed, layout, lens, equations)
+        if flow is not None:
+            cost += flow(state, posed, layout, lens, equations)
         return cost
 
     def advance(self, stage: Stage) -> float:
         """One Gauss-Newton step with the terms of ``stage``; its cost."""
         points = self._point_term(stage)
-        outline = self._outline_term() if stage.outlines else None
+        outline = self._outline_term() if stage.surface else None
+        flow = self._flow_term() if stage.surface else None
         equations = NormalEquations(len(self.observations), self.layout.unknowns, self.layout.shared)
-        before = self.evaluate(self.state, points, outline, equations)
+        before = self.evaluate(self.state, points, outline, flow, equations)
         for _ in range(4):
             local, shared = equations.solve(self.damping)
             turn = np.clip(local[:, :-3], -MAX_TURN, MAX_TURN)
             local = np.concatenate([turn, np.clip(local[:, -3:], -MAX_SHIFT, MAX_SHIFT)], 1)
             state = self.layout.moved(self.state, local, shared)
-            after = self.evaluate(state, points, outline)
+            after = self.evaluate(state, points, outline, flow)
             if after <= before:
                 self.state, self.damping = state, max(self.damping * 0.3, 1e-5)
                 break

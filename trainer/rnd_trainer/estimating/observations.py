@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.npz import Npz, save_npz
 
+from .flow import CELLS, Flow
+
 Image = NDArray[np.uint8]
 Floats32 = NDArray[np.float32]
 
@@ -109,6 +111,7 @@ class Observations:
         hands_px: [T, 2, 21, 2] left and right hand, pixels; NaN where not seen.
         hands_confidence: [T, 2] 0…1; 0 where not seen.
         masks: [T, H, W] coverage.
+        flow: how the person's image moves from each frame to the next, where it was measured.
     """
 
     fps: float
@@ -121,6 +124,7 @@ class Observations:
     hands_px: Floats32
     hands_confidence: Floats32
     masks: Masks
+    flow: Flow | None = None
 
     def __post_init__(self) -> None:
         count, points, hands = len(self.frames), len(BLAZEPOSE), HAND_POINTS
@@ -142,12 +146,12 @@ class Observations:
         return len(self.frames)
 
     def select(self, frames: NDArray[Any] | list[int]) -> Observations:
-        """The observations of some of the T frames, given as a mask or as ascending indices."""
+        """The observations of some of the T frames, given as a mask or as ascending indices; without their flow."""
         arrays = {name: getattr(self, name)[frames] for name in _ARRAYS}
         return Observations(self.fps, self.image_size, masks=self.masks.select(frames), **arrays)
 
 
-_ARRAYS = tuple(f.name for f in fields(Observations) if f.name not in ("fps", "image_size", "masks"))
+_ARRAYS = tuple(f.name for f in fields(Observations) if f.name not in ("fps", "image_size", "masks", "flow"))
 
 
 def save_observations(path: str | Path, observations: Observations) -> None:
@@ -159,6 +163,10 @@ def save_observations(path: str | Path, observations: Observations) -> None:
     arrays["image_size"] = np.array(observations.image_size)
     arrays["masks_png"] = np.frombuffer(b"".join(encoded), np.uint8)
     arrays["masks_ends"] = np.cumsum([len(png) for png in encoded], dtype=np.int64)
+    if observations.flow is not None:
+        arrays["flow_boxes"] = observations.flow.boxes
+        arrays["flow_known"] = np.asarray(np.isfinite(observations.flow.displacement).all(-1))
+        arrays["flow_px"] = np.nan_to_num(observations.flow.displacement)
     save_npz(path, arrays)
 
 
@@ -180,6 +188,7 @@ def load_observations(path: str | Path) -> Observations:
             "keypoints_m": archive.numbers("keypoints_m", (count, points, 3)),
             "hands_confidence": archive.numbers("hands_confidence", (count, 2)),
         }
+        flow = _flow(archive, count) if "flow_px" in archive.names else None
         seen = numbers["hands_confidence"] > 0
         hands = archive.numbers("hands_px", (count, 2, HAND_POINTS, 2))
         hands[~seen] = np.nan
@@ -189,8 +198,16 @@ def load_observations(path: str | Path) -> Observations:
             frames=frames,
             hands_px=hands.astype(np.float32),
             masks=Masks((encoded[a:b] for a, b in zip(starts, ends)), (width, height)),
+            flow=flow,
             **{name: array.astype(np.float32) for name, array in numbers.items()},
         )
+
+
+def _flow(archive: Npz, count: int) -> Flow:
+    pairs = max(count - 1, 0)
+    displacement = archive.numbers("flow_px", (pairs, CELLS, CELLS, 2)).astype(np.float16)
+    displacement[archive.numbers("flow_known", (pairs, CELLS, CELLS)) == 0] = np.nan
+    return Flow(archive.numbers("flow_boxes", (pairs, 4)).astype(np.float64), displacement)
 
 
 def _encode(mask: Image) -> bytes:

@@ -45,6 +45,11 @@ class Posed:
     def __len__(self) -> int:
         return len(self.translations)
 
+    def part(self, frames: slice) -> Posed:
+        """Some of the frames."""
+        arrays = (self.rotations[frames], self.translations[frames])
+        return Posed(self.skeleton, *arrays, self.rest, self.world[frames], self.joints[frames])
+
 
 def pose(skeleton: Skeleton, rotations: Floats, translations: Floats, rest: Floats) -> Posed:
     """Pose ``skeleton`` with its joints at rest at ``rest`` [J, 3] m."""

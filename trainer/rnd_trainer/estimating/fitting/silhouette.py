@@ -9,19 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from .figure import Figure, vertex_normals
-from .kinematics import Posed, shape_derivative, skinned_derivative
+from .kinematics import Posed
 from .normal_equations import NormalEquations
 from .state import Layout, State
+from .surface import Seen, Surface
 from .terms import Lens, project, robust
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-BONES = 3
-"""bones of a vertex that are followed"""
 SAMPLES = 120
-"""points of an outline, and points of the body tested against the mask"""
+"""points of an outline"""
 BORDER = 3
 """px: an outline so near the image's edge is not the person's"""
 GRID = 160
@@ -85,78 +83,28 @@ def _largest(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return (labels == 1 + stats[1:, cv2.CC_STAT_AREA].argmax()).astype(np.uint8)
 
 
-class Surface:
-    """The figure's surface as the silhouette terms use it: fewer vertices, few bones each."""
-
-    def __init__(self, figure: Figure, count: int = 2500, inner: int = SAMPLES) -> None:
-        self.figure = figure
-        body = figure.body
-        rng = np.random.default_rng(1)
-        self.dense = np.sort(rng.choice(len(body.vertices), min(count, len(body.vertices)), replace=False))
-        self.normals = vertex_normals(body.vertices, body.faces)
-        self.bones = np.argsort(-body.skinning_weights, axis=1)[:, :BONES].astype(np.int64)
-        weights = np.take_along_axis(body.skinning_weights.astype(np.float64), self.bones, 1)
-        self.weights = weights / weights.sum(1, keepdims=True)
-        self.inner = _spread(body.vertices, inner)
-
-    def parts(self, posed: Posed, shape: Floats, vertices: Ints) -> Floats:
-        """Positions [T, P, BONES, 3] of ``vertices`` [T, P] as each of their bones moves them."""
-        rest = self.figure.body.vertices[vertices] + np.tensordot(
-            np.moveaxis(self.figure.vertex_basis[:, vertices], 0, -1), shape, 1
-        )
-        bones = self.bones[vertices]
-        frames = np.arange(len(posed))[:, None, None]
-        lever = rest[:, :, None] - posed.rest[bones]
-        return posed.joints[frames, bones] + np.einsum("tpbij,tpbj->tpbi", posed.world[frames, bones], lever)
-
-    def matches(self, state: State, posed: Posed, lens: Lens, outlines: Outlines) -> Ints:
-        """The rim vertex [T, SAMPLES] nearest to each outline point, its normal counted; −1 where there is none."""
-        frames = len(posed)
-        result = np.full((frames, SAMPLES), -1, np.int64)
-        scale = state.focal / np.maximum(-posed.joints[:, 0, 2], 0.05)
-        for k in range(frames):
-            if not outlines.seen[k].any():
-                continue
-            one = _frame(posed, k)
-            parts = self.parts(one, state.shape, self.dense[None])
-            weights = self.weights[self.dense]
-            points = np.einsum("pb,pbi->pi", weights, parts[0])
-            turn = np.einsum("pb,pbij->pij", weights, posed.world[k][self.bones[self.dense]])
-            normals = np.einsum("pij,pj->pi", turn, self.normals[self.dense])
-            view = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
-            rim = np.flatnonzero(np.abs((normals * view).sum(1)) < RIM)
-            if len(rim) < 10:
-                continue
-            pixels, _ = project(points[rim], state, lens)
-            flat = normals[rim, :2] * [1, -1]
-            flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
-            weight = NORMAL_M * scale[k]
-            tree = cKDTree(np.concatenate([pixels, weight * flat], 1))
-            query = np.concatenate([outlines.points[k], weight * outlines.normals[k]], 1)
-            result[k] = self.dense[rim[tree.query(query)[1]]]
-        result[outlines.seen == 0] = -1
-        return result
-
-
-def _frame(posed: Posed, k: int) -> Posed:
-    part = slice(k, k + 1)
-    return Posed(
-        posed.skeleton,
-        posed.rotations[part],
-        posed.translations[part],
-        posed.rest,
-        posed.world[part],
-        posed.joints[part],
-    )
-
-
-def _spread(points: Floats, count: int) -> Ints:
-    """Indices of ``count`` points far from each other."""
-    nearest, chosen = np.full(len(points), np.inf), [0]
-    for _ in range(count - 1):
-        nearest = np.minimum(nearest, ((points - points[chosen[-1]]) ** 2).sum(1))
-        chosen.append(int(nearest.argmax()))
-    return np.array(chosen)
+def rim_matches(surface: Surface, state: State, posed: Posed, lens: Lens, outlines: Outlines) -> Ints:
+    """The rim vertex [T, SAMPLES] nearest to each outline point, its normal counted; −1 where there is none."""
+    frames = len(posed)
+    result = np.full((frames, SAMPLES), -1, np.int64)
+    scale = state.focal / np.maximum(-posed.joints[:, 0, 2], 0.05)
+    for k in range(frames):
+        if not outlines.seen[k].any():
+            continue
+        points, normals = surface.of_frame(state, posed, k)
+        view = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
+        rim = np.flatnonzero(np.abs((normals * view).sum(1)) < RIM)
+        if len(rim) < 10:
+            continue
+        pixels, _ = project(points[rim], state, lens)
+        flat = normals[rim, :2] * [1, -1]
+        flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
+        weight = NORMAL_M * scale[k]
+        tree = cKDTree(np.concatenate([pixels, weight * flat], 1))
+        query = np.concatenate([outlines.points[k], weight * outlines.normals[k]], 1)
+        result[k] = surface.dense[rim[tree.query(query)[1]]]
+    result[outlines.seen == 0] = -1
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +142,8 @@ class OutlineTerm:
         found: NDArray[np.bool_],
         equations: NormalEquations | None,
     ) -> float:
-        pixels, by_unknown, by_shared = self._projected(state, posed, layout, lens, vertices, equations is not None)
-        gap = pixels - self.outlines.points
+        seen = self.surface.seen(state, posed, lens, vertices)
+        gap = seen.pixels - self.outlines.points
         inverse = 1 / self.deviation[:, None]
         residual = (gap * self.outlines.normals).sum(-1) * inverse
         far = 1 / (1 + (gap**2).sum(-1) * inverse**2 / (3 * self.limit) ** 2)  # a match that far is a guess
@@ -204,50 +152,32 @@ class OutlineTerm:
         weight = self.weight * far * found
         cost = float((weight * squares * kept).sum())
         if equations is not None:
-            across = (self.outlines.normals * inverse[..., None])[..., None, :]
-            equations.add(residual, weight * kept**2, (across @ by_unknown)[..., 0, :], (across @ by_shared)[..., 0, :])
+            across = self.outlines.normals * inverse[..., None]
+            equations.add(residual, weight * kept**2, *self._across_image(seen, posed, layout, lens, across))
         return cost
 
     def _inside(
         self, state: State, posed: Posed, layout: Layout, lens: Lens, equations: NormalEquations | None
     ) -> float:
         vertices = np.broadcast_to(self.surface.inner, (len(posed), len(self.surface.inner)))
-        pixels, by_unknown, by_shared = self._projected(state, posed, layout, lens, vertices, equations is not None)
-        value, slope = self._sample(pixels)
+        seen = self.surface.seen(state, posed, lens, vertices)
+        value, slope = self._sample(seen.pixels)
         inverse = 1 / self.deviation[:, None]
         residual = value * inverse
         cost, kept = robust(residual**2, 2 * self.limit)
         if equations is not None:
-            across = (slope * inverse[..., None])[..., None, :]
-            equations.add(
-                residual,
-                self.inner_weight * kept * (value > 0),
-                (across @ by_unknown)[..., 0, :],
-                (across @ by_shared)[..., 0, :],
-            )
+            weight = self.inner_weight * kept * (value > 0)
+            across = slope * inverse[..., None]
+            equations.add(residual, weight, *self._across_image(seen, posed, layout, lens, across))
         return self.inner_weight * cost
 
-    def _projected(
-        self, state: State, posed: Posed, layout: Layout, lens: Lens, vertices: Ints, derive: bool
-    ) -> tuple[Floats, Floats, Floats]:
-        parts = self.surface.parts(posed, state.shape, vertices)
-        bones, weights = self.surface.bones[vertices], self.surface.weights[vertices]
-        points = np.einsum("tpb,tpbi->tpi", weights, parts)
-        pixels, by_point = project(points, state, lens)
-        if not derive:
-            return pixels, np.zeros(0), np.zeros(0)
-        local = by_point @ skinned_derivative(posed, parts, weights, bones, layout.active)
-        figure = self.surface.figure
-        shared = np.zeros((*pixels.shape, layout.shared))
-        if figure.names:
-            frames = np.arange(len(posed))[:, None, None]
-            joints = shape_derivative(posed, figure.joint_basis)[frames, bones]  # [T, P, B, 3, K]
-            lever = figure.vertex_basis[:, vertices][:, :, :, None] - figure.joint_basis[:, bones]
-            lever = np.moveaxis(lever, 0, -1)
-            by_shape = joints + posed.world[frames, bones] @ lever
-            shared[..., layout.shape] = by_point @ np.einsum("tpb,tpbik->tpik", weights, by_shape)
-        shared[..., layout.focal] = pixels - lens.centre
-        return pixels, local, shared
+    def _across_image(
+        self, seen: Seen, posed: Posed, layout: Layout, lens: Lens, direction: Floats
+    ) -> tuple[Floats, Floats]:
+        """Derivatives [T, P, 3A + 3] and [T, P, G] of the pixels along ``direction`` [T, P, 2]."""
+        along = direction[..., None, :]
+        by_pose = along @ self.surface.by_pose(seen, posed, layout)
+        return by_pose[..., 0, :], (along @ self.surface.by_shared(seen, posed, layout, lens))[..., 0, :]
 
     def _sample(self, pixels: Floats) -> tuple[Floats, Floats]:
         """Distance [T, P] px from the mask and its slope [T, P, 2]; bilinear, level outside the image."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
+from rnd_trainer.estimating.flow import flow_of
 from rnd_trainer.estimating.observations import Masks, Observations
 
 from .detection import Detector
@@ -99,6 +100,7 @@ def observe(
         outside.append(_outside(mask, np.concatenate([first[k].points, views.points])))
     merged = _merged(first, second, np.stack(outside), np.array(frames) / video.fps)
     hands = _hands(video, frames, merged, networks.hands, on_progress)
+    flow = flow_of(lambda k: video.frame(frames[k]), masks, lambda done: on_progress("motion", done, len(frames)))
     return Observations(
         fps=video.fps,
         image_size=(video.width, video.height),
@@ -110,6 +112,7 @@ def observe(
         hands_px=np.stack([hand.points for hand in hands]),
         hands_confidence=np.stack([hand.confidence for hand in hands]),
         masks=masks,
+        flow=flow,
     )
 
 

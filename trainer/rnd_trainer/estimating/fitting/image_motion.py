@@ -1,0 +1,85 @@
+"""The body's surface moves between neighbouring frames as the image does.
+
+Rotations in depth move the side that faces the camera across it; landmarks on the bones' axes hardly show them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_trainer.estimating.flow import Flow
+
+from .kinematics import Posed
+from .normal_equations import NormalEquations
+from .state import Layout, State
+from .surface import Ints, Surface
+from .terms import Lens, robust
+
+Floats = NDArray[np.float64]
+
+POINTS = 150
+"""points compared in a frame, at most"""
+_CELL_M = 0.05  # one point in each cell of so many metres at the person's distance
+_DEVIATION_PX, _DEVIATION_M = 0.5, 0.0025  # of measured flow,
+_SHARE = 0.05  # and as a share of the way
+
+
+@dataclass(frozen=True, eq=False)
+class FlowTerm:
+    """Measured displacements of vertices from each of T frames to the next.
+
+    Attributes:
+        vertices: [T − 1, POINTS]; displacement: [T − 1, POINTS, 2] px; inverse: [T − 1, POINTS] one over the
+            deviation, px⁻¹, 0 for none.
+    """
+
+    surface: Surface
+    vertices: Ints
+    displacement: Floats
+    inverse: Floats
+    weight: float = 1.0
+    limit: float = 3.0
+
+    @classmethod
+    def of(
+        cls, surface: Surface, state: State, posed: Posed, lens: Lens, flow: Flow, scale: Floats, weight: float
+    ) -> FlowTerm:
+        """The term of what ``state`` shows to the camera; ``scale`` [T] pixels a metre."""
+        pairs = len(posed) - 1
+        rng = np.random.default_rng(0)
+        vertices = np.zeros((pairs, POINTS), np.int64)
+        displacement, inverse = np.zeros((pairs, POINTS, 2)), np.zeros((pairs, POINTS))
+        for k in range(pairs):
+            found, pixels = surface.visible(state, posed, lens, k)
+            moved = flow.at(k, pixels)
+            known = rng.permutation(np.flatnonzero(np.isfinite(moved).all(1)))
+            cells = np.floor(pixels[known] / (_CELL_M * scale[k]))
+            _, first = np.unique(cells, axis=0, return_index=True)
+            chosen = rng.permutation(known[first])[:POINTS]
+            count = len(chosen)
+            vertices[k, :count], displacement[k, :count] = found[chosen], moved[chosen]
+            way = np.linalg.norm(moved[chosen], axis=1)
+            inverse[k, :count] = 1 / (np.hypot(_DEVIATION_PX, _DEVIATION_M * scale[k]) + _SHARE * way)
+        return cls(surface, vertices, displacement, inverse, weight)
+
+    def __call__(
+        self, state: State, posed: Posed, layout: Layout, lens: Lens, equations: NormalEquations | None
+    ) -> float:
+        ends = [posed.part(slice(0, -1)), posed.part(slice(1, None))]
+        first, last = (self.surface.seen(state, end, lens, self.vertices) for end in ends)
+        residual = (last.pixels - first.pixels - self.displacement) * self.inverse[..., None]
+        cost, kept = robust((residual**2).sum(-1), self.limit)
+        if equations is not None:
+            count = len(residual)
+            parts = [
+                (sign * self.inverse[..., None, None] * self.surface.by_pose(seen, end, layout)).reshape(
+                    count, -1, layout.unknowns
+                )
+                for sign, seen, end in zip((-1, 1), (first, last), ends)
+            ]
+            weight = self.weight * np.repeat(kept, 2, axis=1)
+            equations.add_chain(residual.reshape(count, -1), weight, parts)
+        return self.weight * cost

@@ -1,0 +1,128 @@
+"""The figure's surface as images show it: fewer vertices, few bones each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .figure import Figure, vertex_normals
+from .kinematics import Posed, shape_derivative, skinned_derivative
+from .state import Layout, State
+from .terms import Lens, project
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+BONES = 3
+"""bones of a vertex that are followed"""
+INNER = 120
+"""vertices far from each other, tested against the mask"""
+FACING = 0.3
+"""cosine to the line of sight above which a vertex faces the camera"""
+_CELL_M = 0.03  # of the grid in which nearer vertices hide others, at the person's distance
+_THICKNESS_M = 0.10  # vertices so far behind the nearest are hidden
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Points [T, P] of the surface in the image.
+
+    Attributes:
+        pixels: [T, P, 2]; by_point: [T, P, 2, 3] their derivative by the points.
+        parts: [T, P, BONES, 3] m, the points as each of their bones moves them.
+    """
+
+    vertices: Ints
+    pixels: Floats
+    by_point: Floats
+    parts: Floats
+
+
+class Surface:
+    """``figure``'s surface.
+
+    Attributes:
+        dense: the vertices used; inner: ``INNER`` of all vertices, far from each other.
+    """
+
+    def __init__(self, figure: Figure, count: int = 2500) -> None:
+        self.figure = figure
+        body = figure.body
+        rng = np.random.default_rng(1)
+        self.dense = np.sort(rng.choice(len(body.vertices), min(count, len(body.vertices)), replace=False))
+        self.normals = vertex_normals(body.vertices, body.faces)
+        self.bones = np.argsort(-body.skinning_weights, axis=1)[:, :BONES].astype(np.int64)
+        weights = np.take_along_axis(body.skinning_weights.astype(np.float64), self.bones, 1)
+        self.weights = weights / weights.sum(1, keepdims=True)
+        self.inner = _spread(body.vertices, INNER)
+
+    def of_frame(self, state: State, posed: Posed, frame: int) -> tuple[Floats, Floats]:
+        """Positions and normals [D, 3] of the dense vertices in one frame, in the fit's world."""
+        one = posed.part(slice(frame, frame + 1))
+        weights, bones = self.weights[self.dense], self.bones[self.dense]
+        points = np.einsum("pb,pbi->pi", weights, self._parts(one, state.shape, self.dense[None])[0])
+        turn = np.einsum("pb,pbij->pij", weights, posed.world[frame][bones])
+        return points, np.einsum("pij,pj->pi", turn, self.normals[self.dense])
+
+    def visible(self, state: State, posed: Posed, lens: Lens, frame: int) -> tuple[Ints, Floats]:
+        """Vertices that the camera sees in one frame, and their pixels [P, 2]."""
+        points, normals = self.of_frame(state, posed, frame)
+        facing = -(normals * points).sum(1) / np.maximum(np.linalg.norm(points, axis=1), 1e-9) > FACING
+        pixels, _ = project(points, state, lens)
+        depth = -points[:, 2]
+        cells = np.floor(pixels / (_CELL_M * state.focal / np.maximum(np.median(depth), 0.1))).astype(np.int64)
+        cells -= cells.min(0) - 1
+        nearest = np.full(cells.max(0) + 2, np.inf)
+        x, y = cells.T
+        np.minimum.at(nearest, (x, y), depth)
+        around = [nearest[x + i, y + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        seen = facing & (depth < np.min(around, axis=0) + _THICKNESS_M)
+        return self.dense[seen], pixels[seen]
+
+    def seen(self, state: State, posed: Posed, lens: Lens, vertices: Ints) -> Seen:
+        """``vertices`` [T, P] in the image."""
+        parts = self._parts(posed, state.shape, vertices)
+        points = np.einsum("tpb,tpbi->tpi", self.weights[vertices], parts)
+        return Seen(vertices, *project(points, state, lens), parts)
+
+    def by_pose(self, seen: Seen, posed: Posed, layout: Layout) -> Floats:
+        """d pixels / d unknowns of the frame [T, P, 2, 3A + 3]."""
+        weights, bones = self.weights[seen.vertices], self.bones[seen.vertices]
+        return np.asarray(seen.by_point @ skinned_derivative(posed, seen.parts, weights, bones, layout.active))
+
+    def by_shared(self, seen: Seen, posed: Posed, layout: Layout, lens: Lens) -> Floats:
+        """d pixels / d shared unknowns [T, P, 2, G]: shape and focal length."""
+        figure, vertices = self.figure, seen.vertices
+        shared = np.zeros((*seen.pixels.shape, layout.shared))
+        if figure.names:
+            bones = self.bones[vertices]
+            frames = np.arange(len(posed))[:, None, None]
+            joints = shape_derivative(posed, figure.joint_basis)[frames, bones]  # [T, P, B, 3, K]
+            lever = figure.vertex_basis[:, vertices][:, :, :, None] - figure.joint_basis[:, bones]
+            by_shape = joints + posed.world[frames, bones] @ np.moveaxis(lever, 0, -1)
+            shared[..., layout.shape] = seen.by_point @ np.einsum("tpb,tpbik->tpik", self.weights[vertices], by_shape)
+        shared[..., layout.focal] = seen.pixels - lens.centre
+        return shared
+
+    def _parts(self, posed: Posed, shape: Floats, vertices: Ints) -> Floats:
+        """Positions [T, P, BONES, 3] of ``vertices`` [T, P] as each of their bones moves them."""
+        rest = self.figure.body.vertices[vertices] + np.tensordot(
+            np.moveaxis(self.figure.vertex_basis[:, vertices], 0, -1), shape, 1
+        )
+        bones = self.bones[vertices]
+        frames = np.arange(len(posed))[:, None, None]
+        lever = rest[:, :, None] - posed.rest[bones]
+        return np.asarray(
+            posed.joints[frames, bones] + np.einsum("tpbij,tpbj->tpbi", posed.world[frames, bones], lever)
+        )
+
+
+def _spread(points: Floats, count: int) -> Ints:
+    """Indices of ``count`` points far from each other."""
+    nearest, chosen = np.full(len(points), np.inf), [0]
+    for _ in range(count - 1):
+        nearest = np.minimum(nearest, ((points - points[chosen[-1]]) ** 2).sum(1))
+        chosen.append(int(nearest.argmax()))
+    return np.array(chosen)

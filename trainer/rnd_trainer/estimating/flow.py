@@ -1,0 +1,145 @@
+"""How the image of the person moves from each frame to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Floats32 = NDArray[np.float32]
+
+CELLS = 128
+"""cells of the grid over the person, along each side"""
+_SIDE = 512  # px of the longer side of the images compared
+_ZOOM = 2.0  # of small people, at most
+_MARGIN = 0.04  # of the person's longer side, around it
+_GAP = 0.003  # of that side: forwards and back may differ by it,
+_GAP_SHARE = 0.05  # and by this share of the way
+_TEXTURE = 1.5  # least root-mean-square slope along any direction, grey levels a pixel; less is guessed
+_WINDOW = 4.0  # px, deviation of the window in which texture is measured
+_MAX_GAP = 1.0  # px, after refinement
+_LUCAS_KANADE: dict[str, Any] = {
+    "winSize": (9, 9),
+    "maxLevel": 0,
+    "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01),
+    "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """Optical flow of a person between neighbouring frames of T.
+
+    Attributes:
+        boxes: [T − 1, 4] left, top, right, bottom, pixels; the grid of cells covers them.
+        displacement: [T − 1, CELLS, CELLS, 2] float16 px, of what is at a cell's centre; NaN where it is unknown.
+    """
+
+    boxes: NDArray[np.float64]
+    displacement: NDArray[np.float16]
+
+    def at(self, frame: int, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacements [P, 2] px from ``frame`` to the next of what is at ``pixels`` [P, 2]; NaN where unknown."""
+        box = self.boxes[frame]
+        cells = (pixels - box[:2]) / (box[2:] - box[:2]) * CELLS - 0.5
+        moved = cv2.remap(
+            self.displacement[frame].astype(np.float32),
+            cells.astype(np.float32)[:, None],
+            None,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(np.nan, np.nan),
+        )
+        return moved[:, 0].astype(np.float64)
+
+
+def flow_of(
+    frame: Callable[[int], Image], masks: Iterable[Image], on_frame: Callable[[int], None] = lambda number: None
+) -> Flow:
+    """The flow between neighbouring frames.
+
+    Args:
+        frame: image [H, W, 3], RGB, of number 0…T − 1.
+        masks: of the person, T × [H, W].
+        on_frame: called with how many are done.
+    """
+    pairs = []
+    before: tuple[Image, Image] | None = None
+    for k, mask in enumerate(masks):
+        here = np.asarray(cv2.cvtColor(frame(k), cv2.COLOR_RGB2GRAY), np.uint8), mask
+        if before is not None:
+            pairs.append(_between(before, here))
+        before = here
+        on_frame(k + 1)
+    boxes = np.array([box for box, _ in pairs]).reshape(-1, 4)
+    return Flow(boxes, np.array([moved for _, moved in pairs], np.float16).reshape(-1, CELLS, CELLS, 2))
+
+
+def _between(first: tuple[Image, Image], second: tuple[Image, Image]) -> tuple[NDArray[np.float64], Floats32]:
+    """Box [4] and displacement [CELLS, CELLS, 2] from one (grey image, mask) to the next."""
+    height, width = first[0].shape
+    rows, columns = np.nonzero(np.maximum(first[1], second[1]) > 127)
+    if not len(rows):
+        return np.array([0.0, 0, width, height]), np.full((CELLS, CELLS, 2), np.nan, np.float32)
+    side = max(np.ptp(rows), np.ptp(columns)) + 1
+    margin = round(_MARGIN * side)
+    left, top = max(columns.min() - margin, 0), max(rows.min() - margin, 0)
+    right, bottom = min(columns.max() + 1 + margin, width), min(rows.max() + 1 + margin, height)
+    scale = min(_ZOOM, _SIDE / max(right - left, bottom - top))
+    size = max(1, round((right - left) * scale)), max(1, round((bottom - top) * scale))
+    parts = [
+        cv2.resize(image[top:bottom, left:right], size, interpolation=cv2.INTER_AREA)
+        for pair in (first, second)
+        for image in pair
+    ]
+    grey, mask, next_grey, next_mask = parts
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    there, back = method.calc(grey, next_grey, None), method.calc(next_grey, grey, None)
+    place = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in size)), -1)
+    allowed = _GAP * side * scale
+    gap = np.linalg.norm(there + _moved(back, place + there), axis=-1)
+    known = (mask > 127) & (_moved(next_mask, place + there) > 127) & (_texture(grey) > _TEXTURE / max(scale, 1))
+    known &= gap < allowed + _GAP_SHARE * np.linalg.norm(there, axis=-1)
+    columns, rows = (np.minimum(((np.arange(CELLS) + 0.5) / CELLS * n).astype(int), n - 1) for n in size)
+    cells = np.ix_(rows, columns)
+    displacement = np.full((CELLS, CELLS, 2), np.nan, np.float32)
+    here = known[cells]
+    displacement[here] = _refined(grey, next_grey, place[cells][here], there[cells][here], allowed)
+    box = np.array([left, top, right, bottom], np.float64)
+    return box, np.asarray(displacement * ((box[2:] - box[:2]) / size), np.float32)
+
+
+def _refined(first: Image, second: Image, points: Floats32, moved: Floats32, allowed: float) -> Floats32:
+    """``moved`` [P, 2] px of ``points`` [P, 2] anew, from a small window alone; NaN where going back ends elsewhere.
+
+    Dense flow is smooth, and so is dragged along by a background that stands still.
+    """
+    if not len(points):
+        return moved
+    start, ahead = points[:, None], (points + moved)[:, None]
+    end, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, ahead.copy(), **_LUCAS_KANADE)
+    again, returned, _ = cv2.calcOpticalFlowPyrLK(second, first, end, start.copy(), **_LUCAS_KANADE)
+    way = (end - start)[:, 0]
+    gap = np.linalg.norm((again - start)[:, 0], axis=1)
+    good = (found[:, 0] > 0) & (returned[:, 0] > 0)
+    good &= gap < np.minimum(allowed + _GAP_SHARE * np.linalg.norm(way, axis=1), _MAX_GAP)
+    return np.asarray(np.where(good[:, None], way, np.nan), np.float32)
+
+
+def _moved(image: NDArray[Any], place: Floats32) -> NDArray[Any]:
+    """``image`` at ``place`` [h, w, 2] px; far values outside."""
+    border = (1e3, 1e3) if image.ndim == 3 else (0,)
+    return cv2.remap(image, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=border)
+
+
+def _texture(grey: Image) -> Floats32:
+    """Root of the structure tensor's smaller eigenvalue, grey levels a pixel."""
+    x, y = (cv2.Sobel(grey, cv2.CV_32F, *order) / 8 for order in ((1, 0), (0, 1)))
+    xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _WINDOW) for product in (x * x, x * y, y * y))
+    mean, half = (xx + yy) / 2, (xx - yy) / 2
+    return np.asarray(np.sqrt(np.maximum(mean - np.hypot(half, xy), 0)))
