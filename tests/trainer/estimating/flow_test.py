@@ -26,7 +26,7 @@ def disc(texture: bool, shift: tuple[float, float] = (0, 0), degrees: float = 0)
 def test_a_known_motion_is_found_inside_the_mask_alone() -> None:
     degrees, shift = 4.0, (5.0, -3.0)
     images, masks = zip(disc(True), disc(True, shift, degrees))
-    flow = flow_of(images.__getitem__, masks)
+    flow = flow_of(images.__getitem__, masks, 15.0)[0]
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     inside = SIZE / 2 + 55 * np.stack([np.cos(angle), np.sin(angle)], 1)
     cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
@@ -42,24 +42,36 @@ def test_a_known_motion_is_found_inside_the_mask_alone() -> None:
 def test_what_has_no_texture_or_is_gone_is_unknown() -> None:
     images, masks = zip(disc(False), disc(False, (4.0, 0.0)))
     middle = np.array([[SIZE / 2, SIZE / 2]])
-    assert np.isnan(flow_of(images.__getitem__, masks).at(0, middle)).all()
+    assert np.isnan(flow_of(images.__getitem__, masks, 15.0)[0].at(0, middle)).all()
     images, masks = zip(disc(True), (disc(True)[0], np.zeros((SIZE, SIZE), np.uint8)))
-    assert np.isnan(flow_of(images.__getitem__, masks).displacement).all()
+    assert np.isnan(flow_of(images.__getitem__, masks, 15.0)[0].displacement).all()
     images, masks = zip(disc(True), disc(False))  # another surface
-    assert np.isnan(flow_of(images.__getitem__, masks).at(0, middle)).all()
+    assert np.isnan(flow_of(images.__getitem__, masks, 15.0)[0].at(0, middle)).all()
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_fewer_than_two_frames_have_none(count: int) -> None:
     image, mask = disc(True)
-    assert flow_of(lambda k: image, [mask] * count).displacement.shape == (0, CELLS, CELLS, 2)
+    flows = flow_of(lambda k: image, [mask] * count, 15.0)
+    assert [flow.displacement.shape for flow in flows] == 2 * [(0, CELLS, CELLS, 2)]
+
+
+@pytest.mark.parametrize(("rate", "gaps"), [(5.0, [1]), (15.0, [1, 2]), (30.0, [2, 4]), (60.0, [4, 8])])
+def test_gaps_are_of_the_same_times_at_any_rate(rate: float, gaps: list[int]) -> None:
+    """Frame k is moved by k pixels."""
+    images, masks = zip(*(disc(True, (k, 0.0)) for k in range(9)))
+    flows = flow_of(images.__getitem__, masks, rate)
+    assert [flow.gap for flow in flows] == gaps
+    for flow in flows:
+        assert len(flow.boxes) == len(flow.displacement) == 9 - flow.gap
+        np.testing.assert_allclose(flow.at(0, np.array([[SIZE / 2, SIZE / 2]])), [[flow.gap, 0]], atol=0.1)
 
 
 def test_cells_are_found_by_pixels_of_the_image() -> None:
     displacement = np.full((1, CELLS, CELLS, 2), np.nan, np.float16)
     displacement[0, 32:34, 64] = 3, -2
     displacement[0, 32:34, 65] = 5, -2
-    flow = Flow(np.array([[100.0, 50, 100 + 2 * CELLS, 50 + 4 * CELLS]]), displacement)
+    flow = Flow(1, np.array([[100.0, 50, 100 + 2 * CELLS, 50 + 4 * CELLS]]), displacement)
     centre = np.array([100 + 2 * 64.5, 50 + 4 * 32.5])
     np.testing.assert_allclose(flow.at(0, centre[None] + [[1.0, 0.0]]), [[4, -2]], atol=0.05)
     assert np.isnan(flow.at(0, centre[None] + [[0.0, 4.0]])).all()

@@ -7,8 +7,8 @@ import pytest
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.npz import save_npz
-from rnd_trainer.estimating.observations import Masks, Observations, load_observations, save_observations
 from rnd_trainer.estimating.flow import CELLS, Flow
+from rnd_trainer.estimating.observations import Masks, Observations, load_observations, save_observations
 
 
 def observed(count: int = 4, size: tuple[int, int] = (24, 32)) -> Observations:
@@ -31,7 +31,7 @@ def observed(count: int = 4, size: tuple[int, int] = (24, 32)) -> Observations:
         hands_px=hands,
         hands_confidence=confidence,
         masks=Masks.of(masks, size),
-        flow=Flow(np.tile([1.0, 2, 20, 30], (count - 1, 1)), displacement),
+        flow=(Flow(1, np.tile([1.0, 2, 20, 30], (count - 1, 1)), displacement),),
     )
 
 
@@ -42,16 +42,16 @@ def test_a_file_brings_back_every_number(tmp_path: Path) -> None:
     for name in ("frames", "keypoints_px", "confidence", "spread_px", "keypoints_m", "hands_px", "hands_confidence"):
         np.testing.assert_array_equal(getattr(again, name), getattr(seen, name), err_msg=name)
     np.testing.assert_array_equal(np.asarray(again.masks), np.asarray(seen.masks))
-    assert again.flow is not None and seen.flow is not None
-    np.testing.assert_array_equal(again.flow.displacement, seen.flow.displacement)
-    np.testing.assert_array_equal(again.flow.boxes, seen.flow.boxes)
+    (flow,), (again_flow,) = seen.flow, again.flow
+    np.testing.assert_array_equal(again_flow.displacement, flow.displacement)
+    np.testing.assert_array_equal(again_flow.boxes, flow.boxes)
     assert (again.fps, again.image_size) == (25.0, (24, 32))
 
 
 def test_selected_frames_take_their_masks_along() -> None:
     seen = observed()
     few = seen.select([1, 3])
-    assert few.flow is None  # 1 and 3 are no neighbours
+    assert few.flow == ()
     assert few.frames.tolist() == [2, 6]
     np.testing.assert_array_equal(few.masks[1], seen.masks[3])
     np.testing.assert_array_equal(seen.masks[1:3][1], seen.masks[2])

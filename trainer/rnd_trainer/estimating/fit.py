@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -264,19 +264,19 @@ class Fit:
         deviation = self.weights.outline_m * self._scale()
         return OutlineTerm(self.surface, self.outlines, matches, deviation, self.weights.outline, self.weights.inner)
 
-    def _flow_term(self) -> FlowTerm | None:
-        flow = self.observations.flow
-        if flow is None or self.surface is None:
-            return None
-        posed = self.state.posed(self.figure)
-        return FlowTerm.of(self.surface, self.state, posed, self.lens, flow, self._scale(), self.weights.flow)
+    def _flow_terms(self) -> list[FlowTerm]:
+        surface, posed, scale = self.surface or Surface(self.figure), self.state.posed(self.figure), self._scale()
+        return [
+            FlowTerm.of(surface, self.state, posed, self.lens, flow, scale, self.weights.flow)
+            for flow in self.observations.flow
+        ]
 
     def evaluate(
         self,
         state: State,
         points: PointTerm,
         outline: OutlineTerm | None,
-        flow: FlowTerm | None = None,
+        flows: Sequence[FlowTerm] = (),
         equations: NormalEquations | None = None,
     ) -> float:
         """Cost of ``state``; adds its derivatives to ``equations``."""
@@ -294,23 +294,22 @@ class Fit:
         )
         if outline is not None:
             cost += outline(state, posed, layout, lens, equations)
-        if flow is not None:
-            cost += flow(state, posed, layout, lens, equations)
-        return cost
+        return cost + sum(flow(state, posed, layout, lens, equations) for flow in flows)
 
     def advance(self, stage: Stage) -> float:
         """One Gauss-Newton step with the terms of ``stage``; its cost."""
         points = self._point_term(stage)
         outline = self._outline_term() if stage.surface else None
-        flow = self._flow_term() if stage.surface else None
-        equations = NormalEquations(len(self.observations), self.layout.unknowns, self.layout.shared)
-        before = self.evaluate(self.state, points, outline, flow, equations)
+        flows = self._flow_terms() if stage.surface else []
+        reach = max([2, *(flow.gap for flow in flows)])
+        equations = NormalEquations(len(self.observations), self.layout.unknowns, self.layout.shared, reach)
+        before = self.evaluate(self.state, points, outline, flows, equations)
         for _ in range(4):
             local, shared = equations.solve(self.damping)
             turn = np.clip(local[:, :-3], -MAX_TURN, MAX_TURN)
             local = np.concatenate([turn, np.clip(local[:, -3:], -MAX_SHIFT, MAX_SHIFT)], 1)
             state = self.layout.moved(self.state, local, shared)
-            after = self.evaluate(state, points, outline, flow)
+            after = self.evaluate(state, points, outline, flows)
             if after <= before:
                 self.state, self.damping = state, max(self.damping * 0.3, 1e-5)
                 break

@@ -1,7 +1,8 @@
-"""How the image of the person moves from each frame to the next."""
+"""How the image of the person moves between frames."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,8 @@ Floats32 = NDArray[np.float32]
 
 CELLS = 128
 """cells of the grid over the person, along each side"""
+SECONDS = (1 / 15, 2 / 15)
+"""times over which flow is measured; in shorter ones its errors are as large as the motion"""
 _SIDE = 512  # px of the longer side of the images compared
 _ZOOM = 2.0  # of small people, at most
 _MARGIN = 0.04  # of the person's longer side, around it
@@ -33,18 +36,19 @@ _LUCAS_KANADE: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class Flow:
-    """Optical flow of a person between neighbouring frames of T.
+    """Optical flow of a person from each of T frames to the one ``gap`` frames later.
 
     Attributes:
-        boxes: [T − 1, 4] left, top, right, bottom, pixels; the grid of cells covers them.
-        displacement: [T − 1, CELLS, CELLS, 2] float16 px, of what is at a cell's centre; NaN where it is unknown.
+        boxes: [T − gap, 4] left, top, right, bottom, pixels; the grid of cells covers them.
+        displacement: [T − gap, CELLS, CELLS, 2] float16 px, of what is at a cell's centre; NaN where it is unknown.
     """
 
+    gap: int
     boxes: NDArray[np.float64]
     displacement: NDArray[np.float16]
 
     def at(self, frame: int, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Displacements [P, 2] px from ``frame`` to the next of what is at ``pixels`` [P, 2]; NaN where unknown."""
+        """Displacements [P, 2] px of what ``frame`` shows at ``pixels`` [P, 2]; NaN where unknown."""
         box = self.boxes[frame]
         cells = (pixels - box[:2]) / (box[2:] - box[:2]) * CELLS - 0.5
         moved = cv2.remap(
@@ -59,29 +63,41 @@ class Flow:
 
 
 def flow_of(
-    frame: Callable[[int], Image], masks: Iterable[Image], on_frame: Callable[[int], None] = lambda number: None
-) -> Flow:
-    """The flow between neighbouring frames.
+    frame: Callable[[int], Image],
+    masks: Iterable[Image],
+    rate: float,
+    on_frame: Callable[[int], None] = lambda number: None,
+) -> tuple[Flow, ...]:
+    """Flows over ``SECONDS`` each, as far as frames are that close.
 
     Args:
         frame: image [H, W, 3], RGB, of number 0…T − 1.
         masks: of the person, T × [H, W].
+        rate: frames a second.
         on_frame: called with how many are done.
     """
-    pairs = []
-    before: tuple[Image, Image] | None = None
+    gaps = sorted({max(1, round(seconds * rate)) for seconds in SECONDS})
+    pairs: dict[int, list[tuple[NDArray[np.float64], Floats32]]] = {gap: [] for gap in gaps}
+    before: deque[tuple[Image, Image]] = deque(maxlen=gaps[-1])
     for k, mask in enumerate(masks):
         here = np.asarray(cv2.cvtColor(frame(k), cv2.COLOR_RGB2GRAY), np.uint8), mask
-        if before is not None:
-            pairs.append(_between(before, here))
-        before = here
+        for gap in gaps:
+            if gap <= len(before):
+                pairs[gap].append(_between(before[-gap], here))
+        before.append(here)
         on_frame(k + 1)
-    boxes = np.array([box for box, _ in pairs]).reshape(-1, 4)
-    return Flow(boxes, np.array([moved for _, moved in pairs], np.float16).reshape(-1, CELLS, CELLS, 2))
+    return tuple(
+        Flow(
+            gap,
+            np.array([box for box, _ in found]).reshape(-1, 4),
+            np.array([moved for _, moved in found], np.float16).reshape(-1, CELLS, CELLS, 2),
+        )
+        for gap, found in pairs.items()
+    )
 
 
 def _between(first: tuple[Image, Image], second: tuple[Image, Image]) -> tuple[NDArray[np.float64], Floats32]:
-    """Box [4] and displacement [CELLS, CELLS, 2] from one (grey image, mask) to the next."""
+    """Box [4] and displacement [CELLS, CELLS, 2] from one (grey image, mask) to another."""
     height, width = first[0].shape
     rows, columns = np.nonzero(np.maximum(first[1], second[1]) > 127)
     if not len(rows):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -111,7 +112,7 @@ class Observations:
         hands_px: [T, 2, 21, 2] left and right hand, pixels; NaN where not seen.
         hands_confidence: [T, 2] 0…1; 0 where not seen.
         masks: [T, H, W] coverage.
-        flow: how the person's image moves from each frame to the next, where it was measured.
+        flow: how the person's image moves between frames, where that was measured.
     """
 
     fps: float
@@ -124,7 +125,7 @@ class Observations:
     hands_px: Floats32
     hands_confidence: Floats32
     masks: Masks
-    flow: Flow | None = None
+    flow: tuple[Flow, ...] = ()
 
     def __post_init__(self) -> None:
         count, points, hands = len(self.frames), len(BLAZEPOSE), HAND_POINTS
@@ -163,10 +164,10 @@ def save_observations(path: str | Path, observations: Observations) -> None:
     arrays["image_size"] = np.array(observations.image_size)
     arrays["masks_png"] = np.frombuffer(b"".join(encoded), np.uint8)
     arrays["masks_ends"] = np.cumsum([len(png) for png in encoded], dtype=np.int64)
-    if observations.flow is not None:
-        arrays["flow_boxes"] = observations.flow.boxes
-        arrays["flow_known"] = np.asarray(np.isfinite(observations.flow.displacement).all(-1))
-        arrays["flow_px"] = np.nan_to_num(observations.flow.displacement)
+    for flow in observations.flow:
+        arrays[f"flow{flow.gap}_boxes"] = flow.boxes
+        arrays[f"flow{flow.gap}_known"] = np.asarray(np.isfinite(flow.displacement).all(-1))
+        arrays[f"flow{flow.gap}_px"] = np.nan_to_num(flow.displacement)
     save_npz(path, arrays)
 
 
@@ -188,7 +189,7 @@ def load_observations(path: str | Path) -> Observations:
             "keypoints_m": archive.numbers("keypoints_m", (count, points, 3)),
             "hands_confidence": archive.numbers("hands_confidence", (count, 2)),
         }
-        flow = _flow(archive, count) if "flow_px" in archive.names else None
+        gaps = sorted(int(name[4:-3]) for name in archive.names if re.fullmatch(r"flow[1-9]\d{0,3}_px", name))
         seen = numbers["hands_confidence"] > 0
         hands = archive.numbers("hands_px", (count, 2, HAND_POINTS, 2))
         hands[~seen] = np.nan
@@ -198,16 +199,16 @@ def load_observations(path: str | Path) -> Observations:
             frames=frames,
             hands_px=hands.astype(np.float32),
             masks=Masks((encoded[a:b] for a, b in zip(starts, ends)), (width, height)),
-            flow=flow,
+            flow=tuple(_flow(archive, gap, count) for gap in gaps),
             **{name: array.astype(np.float32) for name, array in numbers.items()},
         )
 
 
-def _flow(archive: Npz, count: int) -> Flow:
-    pairs = max(count - 1, 0)
-    displacement = archive.numbers("flow_px", (pairs, CELLS, CELLS, 2)).astype(np.float16)
-    displacement[archive.numbers("flow_known", (pairs, CELLS, CELLS)) == 0] = np.nan
-    return Flow(archive.numbers("flow_boxes", (pairs, 4)).astype(np.float64), displacement)
+def _flow(archive: Npz, gap: int, count: int) -> Flow:
+    pairs = max(count - gap, 0)
+    displacement = archive.numbers(f"flow{gap}_px", (pairs, CELLS, CELLS, 2)).astype(np.float16)
+    displacement[archive.numbers(f"flow{gap}_known", (pairs, CELLS, CELLS)) == 0] = np.nan
+    return Flow(gap, archive.numbers(f"flow{gap}_boxes", (pairs, 4)), displacement)
 
 
 def _encode(mask: Image) -> bytes:

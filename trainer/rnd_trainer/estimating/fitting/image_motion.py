@@ -1,4 +1,4 @@
-"""The body's surface moves between neighbouring frames as the image does.
+"""The body's surface moves between frames as the image does.
 
 Rotations in depth move the side that faces the camera across it; landmarks on the bones' axes hardly show them.
 """
@@ -29,14 +29,17 @@ _SHARE = 0.05  # and as a share of the way
 
 @dataclass(frozen=True, eq=False)
 class FlowTerm:
-    """Measured displacements of vertices from each of T frames to the next.
+    """Measured displacements of vertices from each of T frames to the one ``gap`` frames later.
+
+    Shape and focal length count as known.
 
     Attributes:
-        vertices: [T − 1, POINTS]; displacement: [T − 1, POINTS, 2] px; inverse: [T − 1, POINTS] one over the
+        vertices: [T − gap, POINTS]; displacement: [T − gap, POINTS, 2] px; inverse: [T − gap, POINTS] one over the
             deviation, px⁻¹, 0 for none.
     """
 
     surface: Surface
+    gap: int
     vertices: Ints
     displacement: Floats
     inverse: Floats
@@ -48,7 +51,7 @@ class FlowTerm:
         cls, surface: Surface, state: State, posed: Posed, lens: Lens, flow: Flow, scale: Floats, weight: float
     ) -> FlowTerm:
         """The term of what ``state`` shows to the camera; ``scale`` [T] pixels a metre."""
-        pairs = len(posed) - 1
+        pairs = max(len(posed) - flow.gap, 0)
         rng = np.random.default_rng(0)
         vertices = np.zeros((pairs, POINTS), np.int64)
         displacement, inverse = np.zeros((pairs, POINTS, 2)), np.zeros((pairs, POINTS))
@@ -63,12 +66,12 @@ class FlowTerm:
             vertices[k, :count], displacement[k, :count] = found[chosen], moved[chosen]
             way = np.linalg.norm(moved[chosen], axis=1)
             inverse[k, :count] = 1 / (np.hypot(_DEVIATION_PX, _DEVIATION_M * scale[k]) + _SHARE * way)
-        return cls(surface, vertices, displacement, inverse, weight)
+        return cls(surface, flow.gap, vertices, displacement, inverse, weight)
 
     def __call__(
         self, state: State, posed: Posed, layout: Layout, lens: Lens, equations: NormalEquations | None
     ) -> float:
-        ends = [posed.part(slice(0, -1)), posed.part(slice(1, None))]
+        ends = [posed.part(slice(0, -self.gap)), posed.part(slice(self.gap, None))]
         first, last = (self.surface.seen(state, end, lens, self.vertices) for end in ends)
         residual = (last.pixels - first.pixels - self.displacement) * self.inverse[..., None]
         cost, kept = robust((residual**2).sum(-1), self.limit)
@@ -81,5 +84,5 @@ class FlowTerm:
                 for sign, seen, end in zip((-1, 1), (first, last), ends)
             ]
             weight = self.weight * np.repeat(kept, 2, axis=1)
-            equations.add_chain(residual.reshape(count, -1), weight, parts)
+            equations.add_chain(residual.reshape(count, -1), weight, parts, self.gap)
         return self.weight * cost

@@ -8,19 +8,16 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 
 Floats = NDArray[np.float64]
 
-REACH = 2
-"""frames ahead that a residual may tie a frame to"""
-
 
 class NormalEquations:
     """½ Σ w r² about a state of T frames with D unknowns each and G shared ones.
 
-    ``cost`` is Σ of the robust losses that the terms report.
+    Args:
+        reach: frames ahead that a residual may tie a frame to.
     """
 
-    def __init__(self, frames: int, unknowns: int, shared: int) -> None:
-        self.cost = 0.0
-        self.blocks = [np.zeros((max(frames - k, 0), unknowns, unknowns)) for k in range(REACH + 1)]
+    def __init__(self, frames: int, unknowns: int, shared: int, reach: int = 2) -> None:
+        self.blocks = [np.zeros((max(frames - k, 0), unknowns, unknowns)) for k in range(reach + 1)]
         self.border = np.zeros((frames, unknowns, shared))
         self.corner = np.zeros((shared, shared))
         self.gradient = np.zeros((frames, unknowns))
@@ -38,14 +35,15 @@ class NormalEquations:
             self.corner += flat.T @ shared.reshape(flat.shape)
             self.shared_gradient += flat.T @ residual.ravel()
 
-    def add_chain(self, residual: Floats, weight: Floats, parts: list[Floats]) -> None:
-        """Residuals [T − n + 1, m] of n = len(parts) frames in a row; ``parts[i]`` [T − n + 1, m, D] of the i-th."""
+    def add_chain(self, residual: Floats, weight: Floats, parts: list[Floats], gap: int = 1) -> None:
+        """Residuals [N, m] of frames t, t + gap, …, t = 0…N − 1; ``parts[i]`` [N, m, D] of the i-th of them."""
         count = len(residual)
         for i, first in enumerate(parts):
             turned = np.swapaxes(first * weight[..., None], 1, 2)
-            self.gradient[i : i + count] += (turned @ residual[..., None])[..., 0]
+            here = slice(i * gap, i * gap + count)
+            self.gradient[here] += (turned @ residual[..., None])[..., 0]
             for j in range(i, len(parts)):
-                self.blocks[j - i][i : i + count] += turned @ parts[j]
+                self.blocks[(j - i) * gap][here] += turned @ parts[j]
 
     def add_shared(self, residual: Floats, weight: Floats, derivative: Floats) -> None:
         """Residuals [m] of the shared unknowns alone, with derivative [m, G]."""
@@ -76,7 +74,7 @@ class NormalEquations:
 
     def _factor(self, damping: float) -> Floats:
         frames, unknowns = self.gradient.shape
-        band = np.zeros((unknowns * (REACH + 1), frames * unknowns))  # lower form: band[i − j, j] = A[i, j]
+        band = np.zeros((unknowns * len(self.blocks), frames * unknowns))  # lower form: band[i − j, j] = A[i, j]
         rows, columns = np.indices((unknowns, unknowns))
         for k, blocks in enumerate(self.blocks):
             if not len(blocks):

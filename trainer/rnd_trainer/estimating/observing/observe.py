@@ -100,7 +100,8 @@ def observe(
         outside.append(_outside(mask, np.concatenate([first[k].points, views.points])))
     merged = _merged(first, second, np.stack(outside), np.array(frames) / video.fps)
     hands = _hands(video, frames, merged, networks.hands, on_progress)
-    flow = flow_of(lambda k: video.frame(frames[k]), masks, lambda done: on_progress("motion", done, len(frames)))
+    rate = video.fps / float(np.median(np.diff(frames)))
+    flow = flow_of(lambda k: video.frame(frames[k]), masks, rate, lambda k: on_progress("motion", k, len(frames)))
     return Observations(
         fps=video.fps,
         image_size=(video.width, video.height),
