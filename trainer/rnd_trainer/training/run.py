@@ -15,7 +15,7 @@ from rnd_runtime.core.files import atomic_path, write_json
 from rnd_runtime.core.signals import at_end, on_signal
 
 from .saving import save_training
-from .training import StepResult, Training
+from .training import POSE_FIT, StepResult, Training
 
 METRICS_FILE, STATUS_FILE = "metrics.jsonl", "status.json"
 """in a run's folder: one row per step; current progress"""
@@ -38,7 +38,8 @@ def run(
 ) -> bool:
     """Train to the last step, saving every ``save_every`` steps and at the end.
 
-    The first Ctrl-C, SIGTERM or SIGHUP finishes the current step and saves; resuming continues the same curve.
+    The first Ctrl-C, SIGTERM or SIGHUP finishes the current step, or leaves a fit of poses, and saves; resuming
+    continues the same curve.
 
     Args:
         folder: for ``metrics.jsonl``, ``status.json``, states and checkpoint.
@@ -59,6 +60,8 @@ def run(
         nonlocal stage
         stage = 0  # the stage's phase begins afterwards
         begin(name, done, of)
+        if interrupted and name == POSE_FIT:
+            raise _LeaveError
 
     def interrupt() -> None:
         nonlocal interrupted
@@ -80,7 +83,10 @@ def run(
                         stage = training.stage
                         cost = training.schedule.cost
                         begin(PHASES[stage], cost(training.step_index), cost(total))
-                    step = training.step()
+                    try:
+                        step = training.step()
+                    except _LeaveError:
+                        break
                     row = {"step": step.index, "stage": step.stage, "seconds": round(training.seconds, 3), **step.terms}
                     log.write(json.dumps(row | ({"skipped": True} if step.skipped else {})) + "\n")
                     status.write(PHASES[step.stage])
@@ -97,6 +103,10 @@ def run(
     stopped = training.step_index < total
     status.end("stopped" if stopped else "finished")
     return stopped
+
+
+class _LeaveError(Exception):
+    """Leaves a step before it has begun."""
 
 
 class _Status:

@@ -34,7 +34,7 @@ from .lighting.skin import TONES, skin_points
 from .objective import Objective
 from .poses.jitter import without_jitter
 from .poses.refinement import PoseRefinement
-from .poses.render_and_compare import SCALE, Compared, Search, fit_pose, frozen
+from .poses.render_and_compare import SCALE, Compared, Search, fit_pose, frozen, unless_raised
 from .poses.uncertainty import load_uncertainty
 from .sampled_poses import VELOCITY_NOISE_RATE, jittered_pose, perturbed_pose
 from .schedule import Schedule
@@ -265,11 +265,14 @@ class Training:
     # -- fits of poses -------------------------------------------------------------------------------------
 
     def _fit_poses(self) -> None:
-        """Correct the poses of all images until the avatar as it is looks like them; it learns from these."""
+        """Correct the poses of all images until the avatar as it is looks like them; it learns from these.
+
+        What ``on_search`` raises leaves the poses as they were.
+        """
         assert self.refinement is not None
         radiance, probes = self.lights.radiance().detach(), self.lights.probes
         generator = torch.Generator().manual_seed(self.config.seed + self.step_index)
-        with frozen(self.model):
+        with frozen(self.model), unless_raised(self.refinement):
             for done, (frame, views) in enumerate(self._small_views.items()):
                 self.on_search(POSE_FIT, done, len(self._small_views))
                 lights = [radiance[self.lights.index(view.frame)] for view in views]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion
 from rnd_trainer.training.poses.uncertainty import PoseUncertainty, save_uncertainty
+from rnd_trainer.training.run import run
 from rnd_trainer.training.saving import resume_training, save_training
 from rnd_trainer.training.schedule import POSE_FITS
 from rnd_trainer.training.training import POSE_FIT, Training
@@ -71,3 +73,24 @@ def test_a_training_resumed_before_a_fit_continues_on_the_same_curve(film, tiny_
     resumed = Training(film, config)
     resume_training(resumed, tmp_path / "training.state")
     assert resumed.step().terms == training.step().terms
+
+
+def test_a_signal_during_a_fit_leaves_it_and_the_run_continues_on_the_same_curve(film, tiny_config, tmp_path) -> None:
+    config = dataclasses.replace(tiny_config, refine_poses=True)
+    torch.set_num_threads(1)
+    at = round(POSE_FITS[0] * config.steps)
+
+    def interrupt(name: str, done: float, total: float) -> None:
+        if name == POSE_FIT and done == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    training = Training(film, config)
+    nothing = {"on_step": lambda step: None, "on_preview": lambda: None}
+    assert run(training, tmp_path, on_phase=interrupt, **nothing)
+    assert training.step_index == at
+    assert training.refinement is not None and not any(raw.any() for raw in training.refinement.raw)
+    resumed, straight = Training(film, config), Training(film, config)
+    resume_training(resumed, tmp_path / "training.state")
+    for _ in range(at):
+        straight.step()
+    assert resumed.step().terms == straight.step().terms

@@ -57,6 +57,18 @@ def frozen(model: nn.Module) -> Iterator[None]:
             parameter.requires_grad_(True)
 
 
+@contextmanager
+def unless_raised(refinement: PoseRefinement) -> Iterator[None]:
+    """Keep the corrections of all frames as they are if an exception leaves the block."""
+    before = [raw.detach().clone() for raw in refinement.raw]
+    try:
+        yield
+    except BaseException:
+        for raw, old in zip(refinement.raw, before):
+            raw.data.copy_(old)
+        raise
+
+
 def fit_pose(
     model: AvatarModel,
     config: TrainConfig,
