@@ -190,7 +190,7 @@ class Fit:
         self.marks: Marks = marks_of(figure)
         self.layout = Layout(figure, self.marks)
         self.times = observations.frames / observations.fps
-        self.surface: Surface | None = None
+        self.surface = Surface(figure)
         self.outlines: Outlines | None = None
         self.damping = 1e-3
         self.cost = np.inf
@@ -256,18 +256,17 @@ class Fit:
         return SmoothTerm(self.times, w.acceleration * factors, w.spin * spins, w.smooth)
 
     def _outline_term(self) -> OutlineTerm:
-        if self.outlines is None or self.surface is None:
+        if self.outlines is None:
             self.outlines = outlines_of(self.observations.masks, len(self.observations), self.observations.image_size)
-            self.surface = Surface(self.figure)
         posed = self.state.posed(self.figure)
         matches = rim_matches(self.surface, self.state, posed, self.lens, self.outlines)
         deviation = self.weights.outline_m * self._scale()
         return OutlineTerm(self.surface, self.outlines, matches, deviation, self.weights.outline, self.weights.inner)
 
     def _flow_terms(self) -> list[FlowTerm]:
-        surface, posed, scale = self.surface or Surface(self.figure), self.state.posed(self.figure), self._scale()
+        posed, scale = self.state.posed(self.figure), self._scale()
         return [
-            FlowTerm.of(surface, self.state, posed, self.lens, flow, scale, self.weights.flow)
+            FlowTerm.of(self.surface, self.state, posed, self.lens, flow, scale, self.weights.flow)
             for flow in self.observations.flow
         ]
 
