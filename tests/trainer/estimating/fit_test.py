@@ -18,7 +18,7 @@ from rnd_trainer.estimating.fitting.kinematics import attached, pose
 from rnd_trainer.estimating.fitting.marks import marks_of
 from rnd_trainer.estimating.fitting.normal_equations import NormalEquations
 from rnd_trainer.estimating.fitting.state import TO_CAMERA
-from rnd_trainer.estimating.flow import Flow, flow_of
+from rnd_trainer.estimating.flow import CELLS, Flow, flow_of
 from rnd_trainer.estimating.lifted import JOINTS, PARENTS, REST_DIRECTIONS, ROLL_AXES, Lifted
 from rnd_trainer.estimating.observations import Masks, Observations
 
@@ -219,6 +219,13 @@ def test_derivatives_agree_with_differences(person, term, part):
 def parts_of(lifted: Lifted, count: int) -> Lifted:
     names = ("directions", "concentration", "roll", "roll_concentration")
     return Lifted(*(getattr(lifted, name)[:count] for name in names))
+
+
+def test_flow_over_more_frames_than_there_are_says_nothing(person):
+    few, lifted = person[0].select(np.arange(4)), parts_of(person[1], 4)
+    few = replace(few, flow=(Flow(8, np.zeros((0, 4)), np.zeros((0, CELLS, CELLS, 2), np.float16)),))
+    fit = Fit(few, lifted, default_figure(), _lens(few, 240.0, None), 1.7)
+    assert np.isfinite(fit.advance(Stage(1, surface=True)))
 
 
 def test_equations_are_solved_as_dense_ones():

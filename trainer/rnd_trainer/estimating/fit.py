@@ -268,6 +268,7 @@ class Fit:
         return [
             FlowTerm.of(self.surface, self.state, posed, self.lens, flow, scale, self.weights.flow)
             for flow in self.observations.flow
+            if len(flow.boxes)
         ]
 
     def evaluate(

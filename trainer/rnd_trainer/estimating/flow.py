@@ -18,6 +18,8 @@ CELLS = 128
 """cells of the grid over the person, along each side"""
 SECONDS = (1 / 15, 2 / 15)
 """times over which flow is measured; in shorter ones its errors are as large as the motion"""
+MAX_GAP = 8
+"""frames, at most; the fit's equations grow with its square"""
 _SIDE = 512  # px of the longer side of the images compared
 _ZOOM = 2.0  # of small people, at most
 _MARGIN = 0.04  # of the person's longer side, around it
@@ -25,7 +27,7 @@ _GAP = 0.003  # of that side: forwards and back may differ by it,
 _GAP_SHARE = 0.05  # and by this share of the way
 _TEXTURE = 1.5  # least root-mean-square slope along any direction, grey levels a pixel; less is guessed
 _WINDOW = 4.0  # px, deviation of the window in which texture is measured
-_MAX_GAP = 1.0  # px, after refinement
+_MAX_ERROR = 1.0  # px, after refinement
 _LUCAS_KANADE: dict[str, Any] = {
     "winSize": (9, 9),
     "maxLevel": 0,
@@ -76,7 +78,7 @@ def flow_of(
         rate: frames a second.
         on_frame: called with how many are done.
     """
-    gaps = sorted({max(1, round(seconds * rate)) for seconds in SECONDS})
+    gaps = sorted({min(max(1, round(seconds * rate)), MAX_GAP) for seconds in SECONDS})
     pairs: dict[int, list[tuple[NDArray[np.float64], Floats32]]] = {gap: [] for gap in gaps}
     before: deque[tuple[Image, Image]] = deque(maxlen=gaps[-1])
     for k, mask in enumerate(masks):
@@ -143,7 +145,7 @@ def _refined(first: Image, second: Image, points: Floats32, moved: Floats32, all
     way = (end - start)[:, 0]
     gap = np.linalg.norm((again - start)[:, 0], axis=1)
     good = (found[:, 0] > 0) & (returned[:, 0] > 0)
-    good &= gap < np.minimum(allowed + _GAP_SHARE * np.linalg.norm(way, axis=1), _MAX_GAP)
+    good &= gap < np.minimum(allowed + _GAP_SHARE * np.linalg.norm(way, axis=1), _MAX_ERROR)
     return np.asarray(np.where(good[:, None], way, np.nan), np.float32)
 
 
