@@ -265,11 +265,10 @@ class Fit:
 
     def _flow_terms(self) -> list[FlowTerm]:
         posed, scale = self.state.posed(self.figure), self._scale()
-        return [
-            FlowTerm.of(self.surface, self.state, posed, self.lens, flow, scale, self.weights.flow)
-            for flow in self.observations.flow
-            if len(flow.boxes)
-        ]
+        flows = [flow for flow in self.observations.flow if len(flow.boxes)]
+        frames = max((len(flow.boxes) for flow in flows), default=0)
+        visible = [self.surface.visible(self.state, posed, self.lens, frame) for frame in range(frames)]
+        return [FlowTerm.of(self.surface, visible, flow, scale, self.weights.flow) for flow in flows]
 
     def evaluate(
         self,

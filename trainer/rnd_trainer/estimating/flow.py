@@ -32,7 +32,6 @@ _LUCAS_KANADE: dict[str, Any] = {
     "winSize": (9, 9),
     "maxLevel": 0,
     "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01),
-    "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
 }
 
 
@@ -139,14 +138,30 @@ def _refined(first: Image, second: Image, points: Floats32, moved: Floats32, all
     """
     if not len(points):
         return moved
-    start, ahead = points[:, None], (points + moved)[:, None]
-    end, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, ahead.copy(), **_LUCAS_KANADE)
-    again, returned, _ = cv2.calcOpticalFlowPyrLK(second, first, end, start.copy(), **_LUCAS_KANADE)
-    way = (end - start)[:, 0]
-    gap = np.linalg.norm((again - start)[:, 0], axis=1)
-    good = (found[:, 0] > 0) & (returned[:, 0] > 0)
-    good &= gap < np.minimum(allowed + _GAP_SHARE * np.linalg.norm(way, axis=1), _MAX_ERROR)
+    ends, gap = tracked(first, second, points, points + moved, **_LUCAS_KANADE)
+    way = ends - points
+    good = gap < np.minimum(allowed + _GAP_SHARE * np.linalg.norm(way, axis=1), _MAX_ERROR)
     return np.asarray(np.where(good[:, None], way, np.nan), np.float32)
+
+
+def tracked(
+    first: Image, second: Image, points: Floats32, guess: Floats32, **options: Any
+) -> tuple[Floats32, Floats32]:
+    """Where ``points`` [P, 2] px of ``first`` are in ``second``, near ``guess``, by Lucas and Kanade 1981.
+
+    Args:
+        options: of OpenCV's ``calcOpticalFlowPyrLK``.
+
+    Returns:
+        The points there; how far from their start they end if followed back, px, infinite where they are lost.
+    """
+    options["flags"] = cv2.OPTFLOW_USE_INITIAL_FLOW
+    start = points[:, None]
+    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, guess[:, None].copy(), **options)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(second, first, there, start.copy(), **options)
+    gap = np.linalg.norm(back - start, axis=-1)
+    gap[(found == 0) | (returned == 0)] = np.inf
+    return there[:, 0], gap[:, 0]
 
 
 def _moved(image: NDArray[Any], place: Floats32) -> NDArray[Any]:

@@ -5,6 +5,7 @@ Rotations in depth move the side that faces the camera across it; landmarks on t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,15 +49,14 @@ class FlowTerm:
 
     @classmethod
     def of(
-        cls, surface: Surface, state: State, posed: Posed, lens: Lens, flow: Flow, scale: Floats, weight: float
+        cls, surface: Surface, visible: Sequence[tuple[Ints, Floats]], flow: Flow, scale: Floats, weight: float
     ) -> FlowTerm:
-        """The term of what ``state`` shows to the camera; ``scale`` [T] pixels a metre."""
-        pairs = max(len(posed) - flow.gap, 0)
+        """The term of the vertices and pixels ``visible`` in each frame; ``scale`` [T] pixels a metre."""
+        pairs = len(flow.boxes)
         rng = np.random.default_rng(0)
         vertices = np.zeros((pairs, POINTS), np.int64)
         displacement, inverse = np.zeros((pairs, POINTS, 2)), np.zeros((pairs, POINTS))
-        for k in range(pairs):
-            found, pixels = surface.visible(state, posed, lens, k)
+        for k, (found, pixels) in enumerate(visible[:pairs]):
             moved = flow.at(k, pixels)
             known = rng.permutation(np.flatnonzero(np.isfinite(moved).all(1)))
             cells = np.floor(pixels[known] / (_CELL_M * scale[k]))

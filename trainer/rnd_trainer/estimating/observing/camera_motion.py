@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_trainer.estimating.flow import tracked
 
 from .regions import Floats, Image, Region
 
@@ -138,13 +139,10 @@ def _rotation(
     first: Image, grey: Image, features: NDArray[Any], lens: Floats, guess: Floats
 ) -> tuple[Floats, float, float] | None:
     """Rotation [3] from the first frame to ``grey``, the background's deviation from it, and its change of size."""
-    ahead = _by(_homography(lens, guess), features[:, 0].astype(np.float64)).astype(np.float32)[:, None]
-    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
-    there, seen, _ = cv2.calcOpticalFlowPyrLK(first, grey, features, ahead.copy(), flags=flags)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(grey, first, there, features.copy(), flags=flags)
-    good = (seen.ravel() > 0) & (returned.ravel() > 0)
-    good &= np.linalg.norm(back - features, axis=-1).ravel() < _RETURN
-    source, target = features[good, 0].astype(np.float64), there[good, 0].astype(np.float64)
+    ahead = _by(_homography(lens, guess), features[:, 0].astype(np.float64)).astype(np.float32)
+    there, gap = tracked(first, grey, features[:, 0], ahead)
+    good = gap < _RETURN
+    source, target = features[good, 0].astype(np.float64), there[good].astype(np.float64)
     if len(source) < _MIN_FEATURES:
         return None
     similar, inliers = cv2.estimateAffinePartial2D(source, target, ransacReprojThreshold=2.0)
