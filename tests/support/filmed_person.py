@@ -11,7 +11,7 @@ from rnd_trainer.estimating.fitting.figure import default_figure
 from rnd_trainer.estimating.fitting.kinematics import attached, pose
 from rnd_trainer.estimating.fitting.marks import marks_of
 from rnd_trainer.estimating.fitting.state import TO_CAMERA
-from rnd_trainer.estimating.observations import Masks, Observations
+from rnd_trainer.estimating.observations import GreyImages, Observations
 
 SIZE, FOCAL, FPS = 160, 190.0, 15.0
 COLOUR, WALL = (170, 90, 60), (90, 110, 130)
@@ -52,6 +52,6 @@ def filmed_person(count: int, turn_deg: float = 360.0) -> tuple[list[np.ndarray]
         keypoints_m=(points - points[:, 23:25].mean(1, keepdims=True)).astype(np.float32),
         hands_px=np.full((count, 2, 21, 2), np.nan, np.float32),
         hands_confidence=np.zeros((count, 2), np.float32),
-        masks=Masks.of(masks, (SIZE, SIZE)),
+        masks=GreyImages.of(masks, (SIZE, SIZE)),
     )
     return frames, observations

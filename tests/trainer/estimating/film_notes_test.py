@@ -9,7 +9,7 @@ import pytest
 
 from rnd_runtime.core.errors import InputError
 from rnd_trainer.estimating.film_notes import cut_off, film_notes, refuse_unusable
-from rnd_trainer.estimating.observations import BLAZEPOSE, Masks, Observations
+from rnd_trainer.estimating.observations import BLAZEPOSE, GreyImages, Observations
 
 COUNT, SIDE = 40, 64
 
@@ -27,7 +27,7 @@ def seen(**changes: object) -> Observations:
         keypoints_m=np.zeros((COUNT, 33, 3), np.float32),
         hands_px=np.zeros((COUNT, 2, 21, 2), np.float32),
         hands_confidence=np.ones((COUNT, 2), np.float32),
-        masks=Masks.of([mask] * COUNT, (SIDE, SIDE)),
+        masks=GreyImages.of([mask] * COUNT, (SIDE, SIDE)),
     )
     return replace(observed, **changes)
 

@@ -13,6 +13,7 @@ from rnd_runtime.capture.body import posed_vertices
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_trainer.estimating.fit import Fit, Stage, Weights, _lens, estimate
+from rnd_trainer.estimating.fitting.appearance import appearance_term
 from rnd_trainer.estimating.fitting.figure import default_figure
 from rnd_trainer.estimating.fitting.kinematics import attached, pose
 from rnd_trainer.estimating.fitting.marks import marks_of
@@ -20,7 +21,7 @@ from rnd_trainer.estimating.fitting.normal_equations import NormalEquations
 from rnd_trainer.estimating.fitting.state import TO_CAMERA
 from rnd_trainer.estimating.flow import CELLS, Flow, flow_of
 from rnd_trainer.estimating.lifted import JOINTS, PARENTS, REST_DIRECTIONS, ROLL_AXES, Lifted
-from rnd_trainer.estimating.observations import Masks, Observations
+from rnd_trainer.estimating.observations import GreyImages, Observations, only_person
 
 FRAMES, SIZE, FOCAL, FPS = 16, 200, 260.0, 15.0
 HANGING = 0.8
@@ -92,8 +93,9 @@ def known_person(noise_px: float = 0.7, seed: int = 0, *, held: bool = False):
         (hint + rng.normal(scale=0.02, size=hint.shape)).astype(np.float32),
         np.full((FRAMES, 2, 21, 2), np.nan, np.float32),
         np.zeros((FRAMES, 2), np.float32),
-        Masks.of(masks, (SIZE, SIZE)),
+        GreyImages.of(masks, (SIZE, SIZE)),
         flow_of(images.__getitem__, masks, FPS),
+        GreyImages.of(map(only_person, images, masks), (SIZE, SIZE)),
     )
     return observations, lifted, posed.joints @ TO_CAMERA, body
 
@@ -175,9 +177,25 @@ def test_flow_mends_what_is_wrong_for_a_while():
     assert errors[1] < 0.8 * errors[0], errors
 
 
+@pytest.mark.slow
+def test_what_other_frames_show_mends_what_is_wrong_in_some():
+    observations, lifted, truth, body = known_person()
+    rng = np.random.default_rng(5)
+    wrong = slice(5, 9)
+    pixels = observations.keypoints_px.copy()
+    pixels[wrong] += 5 * rng.normal(size=(33, 2)).astype(np.float32)  # alike in all, so that they look smooth
+    errors = []
+    for person in (None, observations.person):
+        seen = replace(observations, keypoints_px=pixels, flow=(), person=person)
+        found = camera_joints(estimate(seen, lifted, body=body, focal_px=FOCAL))
+        errors.append(np.linalg.norm((found - found[:, :1]) - (truth - truth[:, :1]), axis=-1)[wrong].mean())
+    assert errors[1] < 0.75 * errors[0], errors
+
+
 @pytest.mark.parametrize(
     ("term", "part"),
     [(term, part) for term in ("points", "outlines") for part in ("pose", "root", "shape", "offsets", "focal")]
+    + [("appearance", part) for part in ("pose", "root", "shape", "focal")]
     + [("flow", "pose"), ("flow", "root")],  # flow and smoothness count a pose's part alone
 )
 def test_derivatives_agree_with_differences(person, term, part):
@@ -186,18 +204,21 @@ def test_derivatives_agree_with_differences(person, term, part):
     if term != "points":
         weights = replace(Weights(), points=0, bones=0, prior=0, smooth=0, still=0, shared=0)
     fit = Fit(few, lifted, default_figure(), _lens(few, 240.0, None), 1.7, replace(weights, ground=0.0, slide=0.0))
-    points, outline, flows = fit._point_term(Stage(1)), None, []
+    points, outline, images = fit._point_term(Stage(1)), None, []
     if term == "outlines":  # wide limits: the weights of far matches are constants of a step
         outline = replace(fit._outline_term(), inner_weight=0.0, limit=1e4)
     if term == "flow":
         whole = person[0].flow
         cut = [Flow(f.gap, f.boxes[: 4 - f.gap], f.displacement[: 4 - f.gap]) for f in whole]
         fit.observations = replace(few, flow=tuple(cut))
-        flows = fit._flow_terms()
-        assert [len(term.vertices) for term in flows] == [3, 2]
-        assert min((term.inverse > 0).sum(1).min() for term in flows) > 20
+        images = fit._flow_terms()
+        assert [len(term.vertices) for term in images] == [3, 2]
+        assert min((term.inverse > 0).sum(1).min() for term in images) > 20
+    if term == "appearance":
+        images = [appearance_term(fit.surface, fit.state, fit.state.posed(fit.figure), fit.lens, few.person, 1.0)]
+        assert (images[0].inverse > 0).sum(1).min() > 20
     equations = NormalEquations(4, fit.layout.unknowns, fit.layout.shared)
-    fit.evaluate(fit.state, points, outline, flows, equations)
+    fit.evaluate(fit.state, points, outline, images, equations)
     rng = np.random.default_rng(0)
     local, shared = np.zeros((4, fit.layout.unknowns)), np.zeros(fit.layout.shared)
     if part == "pose":
@@ -209,7 +230,7 @@ def test_derivatives_agree_with_differences(person, term, part):
         shared[here] = rng.normal(size=shared[here].shape)
     small = 1e-5
     ahead, behind = (
-        fit.evaluate(fit.layout.moved(fit.state, s * local, s * shared), points, outline, flows)
+        fit.evaluate(fit.layout.moved(fit.state, s * local, s * shared), points, outline, images).sum()
         for s in (small, -small)
     )
     slope = 2 * ((equations.gradient * local).sum() + equations.shared_gradient @ shared)

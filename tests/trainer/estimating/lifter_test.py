@@ -9,7 +9,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_trainer.estimating.lifted import JOINTS, PARENTS, REST_DIRECTIONS, REST_OFFSETS, Lifted
 from rnd_trainer.estimating.lifter import CHANNELS, NETWORK, features, lift, looking_at
-from rnd_trainer.estimating.observations import BLAZEPOSE, HAND_POINTS, Masks, Observations
+from rnd_trainer.estimating.observations import BLAZEPOSE, HAND_POINTS, GreyImages, Observations
 
 SIZE = (480, 640)
 FOCAL = 600.0
@@ -60,7 +60,7 @@ def _observations(fps: float, count: int, yaws: np.ndarray, lowered: float = 0.9
         (points - hips).astype(np.float32),
         np.full((count, 2, HAND_POINTS, 2), np.nan, np.float32),
         np.zeros((count, 2), np.float32),
-        Masks.of([np.zeros(SIZE[::-1], np.uint8)] * count, SIZE),
+        GreyImages.of([np.zeros(SIZE[::-1], np.uint8)] * count, SIZE),
     )
     return seen, directions
 

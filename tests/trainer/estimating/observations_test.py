@@ -8,7 +8,7 @@ import pytest
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.npz import save_npz
 from rnd_trainer.estimating.flow import CELLS, Flow
-from rnd_trainer.estimating.observations import Masks, Observations, load_observations, save_observations
+from rnd_trainer.estimating.observations import GreyImages, Observations, load_observations, save_observations
 
 
 def observed(count: int = 4, size: tuple[int, int] = (24, 32)) -> Observations:
@@ -30,7 +30,7 @@ def observed(count: int = 4, size: tuple[int, int] = (24, 32)) -> Observations:
         keypoints_m=rng.normal(size=(count, 33, 3)).astype(np.float32),
         hands_px=hands,
         hands_confidence=confidence,
-        masks=Masks.of(masks, size),
+        masks=GreyImages.of(masks, size),
         flow=(Flow(1, np.tile([1.0, 2, 20, 30], (count - 1, 1)), displacement),),
     )
 
@@ -69,5 +69,5 @@ def test_wrong_shapes_and_damaged_masks_are_refused(tmp_path: Path) -> None:
         load_observations(tmp_path / "cut.npz")
     scrambled = {**arrays, "masks_png": np.zeros_like(arrays["masks_png"])}
     save_npz(tmp_path / "scrambled.npz", scrambled)
-    with pytest.raises(InputError, match="mask"):
+    with pytest.raises(InputError, match="grey image"):
         load_observations(tmp_path / "scrambled.npz").masks[0]

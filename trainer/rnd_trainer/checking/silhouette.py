@@ -63,12 +63,12 @@ def _nearest_faces(
         pixels = flat @ camera.K[:2, :2].T + camera.K[:2, 2]
     usable = (depth > NEAR) & np.isfinite(pixels).all(1) & (np.abs(pixels) < 1e6).all(1)
     visible = faces[usable[faces].all(1)]
-    nearest = _z_buffer(pixels, 1 / np.where(usable, depth, 1), visible, camera.width, camera.height)
+    nearest = z_buffer(pixels, 1 / np.where(usable, depth, 1), visible, camera.width, camera.height)
     return local, visible, nearest
 
 
 @numba.njit(cache=True)
-def _z_buffer(pixels, inverse_depth, faces, width, height):
+def z_buffer(pixels, inverse_depth, faces, width, height):
     """Index [H, W] of the nearest face at each pixel centre, −1 without one."""
     nearest = np.full((height, width), -1, np.int64)
     depth = np.zeros((height, width))  # 1/z, linear in the image

@@ -13,6 +13,7 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import Motion
 
+from .fitting.appearance import AppearanceTerm, appearance_term
 from .fitting.figure import Figure, default_figure, known_figure
 from .fitting.image_motion import FlowTerm
 from .fitting.kinematics import Posed
@@ -66,6 +67,7 @@ class Weights:
     inner: float = 0.15  # factor of body points that lie outside of the mask
     outline_m: float = 0.012  # deviation of outlines at the person's distance, m
     flow: float = 0.5  # factor of the surface's motion in the image
+    appearance: float = 1.0  # factor of the surface's places by what it looks like in other frames
     ground: float = 1.0  # factor of feet on the ground
     slide: float = 0.03  # factor of standing feet that move
     shared: float = 0.1  # share of the frames that count as independent, in the weight of shape and focal length
@@ -77,13 +79,20 @@ class Stage:
 
     steps: int
     surface: bool = False  # the terms of outlines and flow
+    appearance: bool = False  # what the stage's first pose looks like in other frames
     points: float = 1.0
     limit: float = 3.0
 
 
 CONVERGED = 1e-3
 """relative fall of the cost below which a stage ends"""
-STAGES = (Stage(8, points=0.3, limit=8.0), Stage(10, limit=5.0), Stage(14, surface=True))
+STAGES = (
+    Stage(8, points=0.3, limit=8.0),
+    Stage(10, limit=5.0),
+    Stage(14, surface=True),
+    Stage(5, surface=True, appearance=True),
+    Stage(5, surface=True, appearance=True),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +164,7 @@ def estimate(
     done = 0
     for stage in STAGES:
         cost = np.inf
+        fit.begin(stage)
         for number in range(stage.steps):
             before, cost = cost, fit.advance(stage)
             on_progress(done + number + 1, total)
@@ -196,7 +206,8 @@ class Fit:
         self.cost = np.inf
         self.state = self._start()
         self._smooth = self._smoothness()
-        self._still = StillTerm.of(self.times, self.state.rotations, weights.still)
+        self._appearance: tuple[AppearanceTerm, ...] = ()
+        self._still = StillTerm.of(self.times, self.state.rotations, self.figure.body.skeleton.names, weights.still)
 
     def _start(self) -> State:
         observations, figure = self.observations, self.figure
@@ -275,10 +286,10 @@ class Fit:
         state: State,
         points: PointTerm,
         outline: OutlineTerm | None,
-        flows: Sequence[FlowTerm] = (),
+        images: Sequence[FlowTerm | AppearanceTerm] = (),
         equations: NormalEquations | None = None,
-    ) -> float:
-        """Cost of ``state``; adds its derivatives to ``equations``."""
+    ) -> Floats:
+        """Costs [T] of ``state`` by frame, what all share spread evenly; adds its derivatives to ``equations``."""
         figure, marks, layout, lens, w = self.figure, self.marks, self.layout, self.lens, self.weights
         posed = state.posed(figure)
         cost = points(state, posed, figure, marks, layout, lens, equations)
@@ -288,12 +299,22 @@ class Fit:
         cost += self._smooth(posed, layout, equations)
         cost += self._still(posed, layout, equations)
         cost += GroundTerm(self.times, w.ground, w.slide)(state, posed, figure, marks, layout, equations)
-        cost += SharedTerm(lens, 1 + w.shared * len(state.translations), self.height)(
-            state, figure, marks, layout, equations
-        )
+        shared = SharedTerm(lens, 1 + w.shared * len(posed), self.height)
+        cost += shared(state, figure, marks, layout, equations) / len(posed)
         if outline is not None:
             cost += outline(state, posed, layout, lens, equations)
-        return cost + sum(flow(state, posed, layout, lens, equations) for flow in flows)
+        for term in images:
+            cost += term(state, posed, layout, lens, equations)
+        return cost
+
+    def begin(self, stage: Stage) -> None:
+        """Compare frames with each other, if ``stage`` needs that, in the pose so far."""
+        person = self.observations.person
+        self._appearance = ()
+        if stage.appearance and person is not None:
+            posed = self.state.posed(self.figure)
+            term = appearance_term(self.surface, self.state, posed, self.lens, person, self.weights.appearance)
+            self._appearance = (term,)
 
     def advance(self, stage: Stage) -> float:
         """One Gauss-Newton step with the terms of ``stage``; its cost."""
@@ -302,13 +323,14 @@ class Fit:
         flows = self._flow_terms() if stage.surface else []
         reach = max([2, *(flow.gap for flow in flows)])
         equations = NormalEquations(len(self.observations), self.layout.unknowns, self.layout.shared, reach)
-        before = self.evaluate(self.state, points, outline, flows, equations)
+        images: list[FlowTerm | AppearanceTerm] = [*flows, *self._appearance]
+        before = float(self.evaluate(self.state, points, outline, images, equations).sum())
         for _ in range(4):
             local, shared = equations.solve(self.damping)
             turn = np.clip(local[:, :-3], -MAX_TURN, MAX_TURN)
             local = np.concatenate([turn, np.clip(local[:, -3:], -MAX_SHIFT, MAX_SHIFT)], 1)
             state = self.layout.moved(self.state, local, shared)
-            after = self.evaluate(state, points, outline, flows)
+            after = float(self.evaluate(state, points, outline, images).sum())
             if after <= before:
                 self.state, self.damping = state, max(self.damping * 0.3, 1e-5)
                 break

@@ -120,7 +120,7 @@ def _between(first: tuple[Image, Image], second: tuple[Image, Image]) -> tuple[N
     place = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in size)), -1)
     allowed = _GAP * side * scale
     gap = np.linalg.norm(there + _moved(back, place + there), axis=-1)
-    known = (mask > 127) & (_moved(next_mask, place + there) > 127) & (_texture(grey) > _TEXTURE / max(scale, 1))
+    known = (mask > 127) & (_moved(next_mask, place + there) > 127) & (texture(grey) > _TEXTURE / max(scale, 1))
     known &= gap < allowed + _GAP_SHARE * np.linalg.norm(there, axis=-1)
     columns, rows = (np.minimum(((np.arange(CELLS) + 0.5) / CELLS * n).astype(int), n - 1) for n in size)
     cells = np.ix_(rows, columns)
@@ -170,7 +170,7 @@ def _moved(image: NDArray[Any], place: Floats32) -> NDArray[Any]:
     return cv2.remap(image, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=border)
 
 
-def _texture(grey: Image) -> Floats32:
+def texture(grey: Image) -> Floats32:
     """Root of the structure tensor's smaller eigenvalue, grey levels a pixel."""
     x, y = (cv2.Sobel(grey, cv2.CV_32F, *order) / 8 for order in ((1, 0), (0, 1)))
     xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _WINDOW) for product in (x * x, x * y, y * y))

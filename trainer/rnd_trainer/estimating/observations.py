@@ -36,13 +36,14 @@ TRUNK = [BLAZEPOSE.index(side + joint) for joint in ("shoulder", "hip") for side
 """points of the shoulders and hips; likewise of the face, hands, and heels with toes"""
 HAND_POINTS = 21
 """points of a hand: the wrist, then four of each finger from the thumb on, base to tip"""
-_LEVEL = 3  # zlib's, of a mask's PNG: higher ones cost time and save little
+_SURE = 200  # of 255, a mask's value well inside of the person
+_LEVEL = 3  # zlib's, of a PNG: higher ones cost time and save little
 
 
-class Masks:
-    """Soft masks [T, H, W] uint8, 255 is the person; stored compressed, decoded when indexed.
+class GreyImages:
+    """Images [T, H, W] uint8, such as masks (255 is the person); stored compressed, decoded when indexed.
 
-    ``masks[k]`` is [H, W], a slice or an index array gives [n, H, W]; ``numpy.asarray(masks)`` decodes all of them.
+    ``images[k]`` is [H, W], a slice or an index array gives [n, H, W]; ``numpy.asarray(images)`` decodes all of them.
     """
 
     def __init__(self, encoded: Iterable[bytes], image_size: tuple[int, int]) -> None:
@@ -50,9 +51,9 @@ class Masks:
         self.image_size = image_size
 
     @classmethod
-    def of(cls, masks: Iterable[Image], image_size: tuple[int, int]) -> Masks:
-        """Encode ``masks`` [H, W] one by one."""
-        return cls((_encode(mask) for mask in masks), image_size)
+    def of(cls, images: Iterable[Image], image_size: tuple[int, int]) -> GreyImages:
+        """Encode ``images`` [H, W] one by one."""
+        return cls((_encode(image) for image in images), image_size)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -73,27 +74,29 @@ class Masks:
         if isinstance(index, int | np.integer):
             return self._decode(int(index))
         chosen = np.arange(len(self))[index]
-        masks = np.empty((len(chosen), *self.shape[1:]), np.uint8)
+        images = np.empty((len(chosen), *self.shape[1:]), np.uint8)
         for k, frame in enumerate(chosen):
-            masks[k] = self._decode(int(frame))
-        return masks
+            images[k] = self._decode(int(frame))
+        return images
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return self[:].astype(dtype or np.uint8, copy=False)
 
-    def append(self, mask: Image) -> None:
-        """Encode one more mask."""
-        self.encoded.append(_encode(mask))
+    def append(self, image: Image) -> None:
+        """Encode one more image."""
+        self.encoded.append(_encode(image))
 
-    def select(self, frames: NDArray[Any] | list[int]) -> Masks:
-        """The masks of these frames, not decoded."""
-        return Masks((self.encoded[int(k)] for k in np.arange(len(self))[frames]), self.image_size)
+    def select(self, frames: NDArray[Any] | list[int]) -> GreyImages:
+        """The images of these frames, not decoded."""
+        return GreyImages((self.encoded[int(k)] for k in np.arange(len(self))[frames]), self.image_size)
 
     def _decode(self, frame: int) -> Image:
         pixels = cv2.imdecode(np.frombuffer(self.encoded[frame], np.uint8), cv2.IMREAD_GRAYSCALE)
         if pixels is None or pixels.shape != self.shape[1:]:
             got = "damaged data" if pixels is None else f"{pixels.shape[1]} x {pixels.shape[0]}"
-            raise InputError("mask", expected=f"{self.image_size[0]} x {self.image_size[1]}", got=got, frame=frame)
+            raise InputError(
+                "grey image", expected=f"{self.image_size[0]} x {self.image_size[1]}", got=got, frame=frame
+            )
         return np.asarray(pixels, np.uint8)
 
 
@@ -113,6 +116,7 @@ class Observations:
         hands_confidence: [T, 2] 0…1; 0 where not seen.
         masks: [T, H, W] coverage.
         flow: how the person's image moves between frames, where that was measured.
+        person: grey levels [T, H, W] of the person, 0 elsewhere, where they were kept.
     """
 
     fps: float
@@ -124,8 +128,9 @@ class Observations:
     keypoints_m: Floats32
     hands_px: Floats32
     hands_confidence: Floats32
-    masks: Masks
+    masks: GreyImages
     flow: tuple[Flow, ...] = ()
+    person: GreyImages | None = None
 
     def __post_init__(self) -> None:
         count, points, hands = len(self.frames), len(BLAZEPOSE), HAND_POINTS
@@ -149,21 +154,29 @@ class Observations:
     def select(self, frames: NDArray[Any] | list[int]) -> Observations:
         """The observations of some of the T frames, given as a mask or as ascending indices; without their flow."""
         arrays = {name: getattr(self, name)[frames] for name in _ARRAYS}
-        return Observations(self.fps, self.image_size, masks=self.masks.select(frames), **arrays)
+        person = self.person and self.person.select(frames)
+        return Observations(self.fps, self.image_size, masks=self.masks.select(frames), person=person, **arrays)
 
 
-_ARRAYS = tuple(f.name for f in fields(Observations) if f.name not in ("fps", "image_size", "masks", "flow"))
+_ARRAYS = tuple(f.name for f in fields(Observations) if f.name not in ("fps", "image_size", "masks", "flow", "person"))
+
+
+def only_person(image: Image, mask: Image) -> Image:
+    """Grey levels 1…255 [H, W] of ``image`` [H, W, 3], RGB, where ``mask`` is sure of the person; 0 elsewhere."""
+    grey = np.maximum(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), 1)
+    return np.where(mask > _SURE, grey, 0).astype(np.uint8)
 
 
 def save_observations(path: str | Path, observations: Observations) -> None:
-    """Write ``observations`` as one .npz; its masks are PNGs in a row."""
-    encoded = observations.masks.encoded
+    """Write ``observations`` as one .npz; its images are PNGs in a row."""
     arrays: dict[str, NDArray[Any]] = {name: getattr(observations, name) for name in _ARRAYS}
     arrays["hands_px"] = np.nan_to_num(observations.hands_px)  # readers refuse NaN; hands_confidence says where it is
     arrays["fps"] = np.array(observations.fps)
     arrays["image_size"] = np.array(observations.image_size)
-    arrays["masks_png"] = np.frombuffer(b"".join(encoded), np.uint8)
-    arrays["masks_ends"] = np.cumsum([len(png) for png in encoded], dtype=np.int64)
+    for name in ("masks", "person"):
+        if images := getattr(observations, name):
+            arrays[f"{name}_png"] = np.frombuffer(b"".join(images.encoded), np.uint8)
+            arrays[f"{name}_ends"] = np.cumsum([len(png) for png in images.encoded], dtype=np.int64)
     for flow in observations.flow:
         arrays[f"flow{flow.gap}_boxes"] = flow.boxes
         arrays[f"flow{flow.gap}_known"] = np.asarray(np.isfinite(flow.displacement).all(-1))
@@ -177,11 +190,6 @@ def load_observations(path: str | Path) -> Observations:
         width, height = (int(side) for side in archive.numbers("image_size", (2,)))
         frames = archive.numbers("frames", (None,)).astype(np.int64)
         count, points = len(frames), len(BLAZEPOSE)
-        pixels, ends = archive.numbers("masks_png", (None,)), archive.numbers("masks_ends", (count,)).astype(np.int64)
-        starts = np.concatenate([[0], ends[:-1]])
-        if (ends <= starts).any() or (count and ends[-1] != len(pixels)):
-            raise InputError("masks_ends", expected="ascending positions in masks_png", got="others", file=path)
-        encoded = pixels.astype(np.uint8).tobytes()
         numbers = {
             "keypoints_px": archive.numbers("keypoints_px", (count, points, 2)),
             "confidence": archive.numbers("confidence", (count, points)),
@@ -198,10 +206,21 @@ def load_observations(path: str | Path) -> Observations:
             image_size=(width, height),
             frames=frames,
             hands_px=hands.astype(np.float32),
-            masks=Masks((encoded[a:b] for a, b in zip(starts, ends)), (width, height)),
+            masks=_images(archive, "masks", count, (width, height)),
+            person=_images(archive, "person", count, (width, height)) if "person_png" in archive.names else None,
             flow=tuple(_flow(archive, gap, count) for gap in gaps),
             **{name: array.astype(np.float32) for name, array in numbers.items()},
         )
+
+
+def _images(archive: Npz, name: str, count: int, size: tuple[int, int]) -> GreyImages:
+    pixels = archive.numbers(f"{name}_png", (None,)).astype(np.uint8)
+    ends = archive.numbers(f"{name}_ends", (count,)).astype(np.int64)
+    starts = np.concatenate([[0], ends[:-1]])
+    if (ends <= starts).any() or (count and ends[-1] != len(pixels)):
+        raise InputError(f"{name}_ends", expected=f"ascending positions in {name}_png", got="others", file=archive.path)
+    encoded = pixels.tobytes()
+    return GreyImages((encoded[a:b] for a, b in zip(starts, ends)), size)
 
 
 def _flow(archive: Npz, gap: int, count: int) -> Flow:
@@ -211,7 +230,7 @@ def _flow(archive: Npz, gap: int, count: int) -> Flow:
     return Flow(gap, archive.numbers(f"flow{gap}_boxes", (pairs, 4)), displacement)
 
 
-def _encode(mask: Image) -> bytes:
-    done, png = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, _LEVEL])
+def _encode(image: Image) -> bytes:
+    done, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, _LEVEL])
     assert done
     return bytes(png)

@@ -16,7 +16,7 @@ from rnd_trainer.estimating.flow import Flow
 from .kinematics import Posed
 from .normal_equations import NormalEquations
 from .state import Layout, State
-from .surface import Ints, Surface
+from .surface import Ints, Surface, spaced
 from .terms import Lens, robust
 
 Floats = NDArray[np.float64]
@@ -58,10 +58,7 @@ class FlowTerm:
         displacement, inverse = np.zeros((pairs, POINTS, 2)), np.zeros((pairs, POINTS))
         for k, (found, pixels) in enumerate(visible[:pairs]):
             moved = flow.at(k, pixels)
-            known = rng.permutation(np.flatnonzero(np.isfinite(moved).all(1)))
-            cells = np.floor(pixels[known] / (_CELL_M * scale[k]))
-            _, first = np.unique(cells, axis=0, return_index=True)
-            chosen = rng.permutation(known[first])[:POINTS]
+            chosen = spaced(pixels, np.flatnonzero(np.isfinite(moved).all(1)), _CELL_M * scale[k], POINTS, rng)
             count = len(chosen)
             vertices[k, :count], displacement[k, :count] = found[chosen], moved[chosen]
             way = np.linalg.norm(moved[chosen], axis=1)
@@ -70,7 +67,7 @@ class FlowTerm:
 
     def __call__(
         self, state: State, posed: Posed, layout: Layout, lens: Lens, equations: NormalEquations | None
-    ) -> float:
+    ) -> Floats:
         ends = [posed.part(slice(0, -self.gap)), posed.part(slice(self.gap, None))]
         first, last = (self.surface.seen(state, end, lens, self.vertices) for end in ends)
         residual = (last.pixels - first.pixels - self.displacement) * self.inverse[..., None]
@@ -85,4 +82,4 @@ class FlowTerm:
             ]
             weight = self.weight * np.repeat(kept, 2, axis=1)
             equations.add_chain(residual.reshape(count, -1), weight, parts, self.gap)
-        return self.weight * cost
+        return np.pad(self.weight * cost, (0, self.gap))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,9 @@ STILL_DRIFT = 0.013
 """rad/√s, of a joint that keeps still"""
 STILL_RATE = 0.3
 """rad/s; a joint that usually turns so fast drifts twice as far"""
+COLLAR = 0.35
+"""rotation of a collar to its arm's: the lifter, whose bones end at the shoulders, sees arms move but not collars"""
+_TRUNK = ("spine1", "spine2", "spine3", "neck", "head")  # turn together
 
 
 def right_jacobian_inverse(vectors: Floats) -> Floats:
@@ -48,16 +52,15 @@ class PriorTerm:
     weight: float = 0.05
     limit_deviation: float = 0.08  # rad past straight
 
-    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> float:
+    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> Floats:
         names = posed.skeleton.names
         order = [names.index(name) for name in JOINTS[1:]]
         columns = [int(np.flatnonzero(layout.active == k)[0]) for k in order]
         vectors = matrix_to_axis_angle(posed.rotations[:, order])  # [T, 21, 3]
         count = len(vectors)
         residual = (vectors.reshape(count, -1) - self.prior.mean) @ self.prior.whiten.T
-        cost = self.weight * float((residual**2).sum())
         hinge, signs = self._hinges(vectors)
-        cost += float((hinge**2).sum())
+        cost = self.weight * (residual**2).sum(1) + (hinge**2).sum(1)
         if equations is not None:
             turn = right_jacobian_inverse(vectors)
             local = np.zeros((count, residual.shape[1], layout.unknowns))
@@ -98,9 +101,9 @@ class SmoothTerm:
     weight: float = 1.0
     limit: float = 4.0
 
-    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> float:
+    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> Floats:
         if len(posed) < 3:
-            return 0.0
+            return np.zeros(len(posed))
         before, after = np.diff(self.times)[:-1], np.diff(self.times)[1:]
         first, last = 2 / (before * (before + after)), 2 / (after * (before + after))
         factors = np.stack([first, -first - last, last], 1)[:, :, None, None]  # [T − 2, 3, 1, 1]
@@ -124,7 +127,7 @@ class SmoothTerm:
             weight = self.weight * np.repeat(kept, 3, axis=1)
             equations.add_chain(residual.reshape(count, -1), weight, parts)
             self._add_spin(equations, steps, span, middle, spin, spin_kept, layout)
-        return self.weight * (cost + spin_cost)
+        return np.pad(self.weight * (cost + spin_cost), 1)
 
     def _add_spin(
         self,
@@ -164,16 +167,21 @@ class StillTerm:
     limit: float = 2.0  # in deviations
 
     @classmethod
-    def of(cls, times: Floats, rotations: Floats, weight: float) -> StillTerm:
-        """The term of local rotations [T, J, 3, 3] at ``times``, s."""
+    def of(cls, times: Floats, rotations: Floats, names: Sequence[str], weight: float) -> StillTerm:
+        """The term of local rotations [T, J, 3, 3] of joints ``names`` at ``times``, s."""
         seconds = np.diff(times)
         rates = np.linalg.norm(_steps(rotations), axis=-1) / seconds[:, None]
         around = max(1, round(AROUND_SECONDS / float(np.median(seconds))))
         usual = median_filter(rates, (around, 1), mode="nearest")
+        trunk = [names.index(name) for name in _TRUNK]
+        usual[:, trunk] = usual[:, trunk].max(1, keepdims=True)
+        for side in ("left", "right"):
+            collar, shoulder = names.index(f"{side}_collar"), names.index(f"{side}_shoulder")
+            usual[:, collar] = np.maximum(usual[:, collar], COLLAR * usual[:, shoulder])
         drift = STILL_DRIFT * (1 + (usual / STILL_RATE) ** 3)
         return cls(drift * np.sqrt(seconds)[:, None], weight)
 
-    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> float:
+    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> Floats:
         active = layout.active
         steps = _steps(posed.rotations[:, active])
         scale = ((active != 0) / self.steps[:, active])[..., None]
@@ -184,7 +192,7 @@ class StillTerm:
             parts = [_of_each_joint(scale[..., None] * block, layout.unknowns) for block in (backward, forward)]
             weight = self.weight * np.repeat(kept, 3, axis=1)
             equations.add_chain(residual.reshape(len(residual), -1), weight, parts)
-        return self.weight * cost
+        return np.pad(self.weight * cost, (1, 0))
 
 
 def _steps(rotations: Floats) -> Floats:
@@ -221,7 +229,7 @@ class GroundTerm:
         marks: Marks,
         layout: Layout,
         equations: NormalEquations | None,
-    ) -> float:
+    ) -> Floats:
         chosen = np.array(FEET)
         soles = _part(marks, chosen)
         places = soles.places + np.tensordot(state.shape, soles.basis, 1)
@@ -233,14 +241,14 @@ class GroundTerm:
         kept = np.where(heights < self.reach_m * 3, kept, 0)
         below = np.where(heights < 0, 1.0, 0.0)
         sunk = np.minimum(heights, 0) / self.height_m
-        cost += float((sunk**2).sum())
+        cost += (sunk**2).sum(1)
         standing = np.exp(-0.5 * np.maximum(heights, 0) ** 2 / self.reach_m**2)
         span = np.diff(self.times)[:, None, None]
         slide = np.diff(points, axis=0) / span / self.slip
         weights = np.minimum(standing[1:], standing[:-1])
         squares = (slide**2).sum(-1)
         slide_kept = 1 / (1 + squares / (self.moving / self.slip) ** 2)
-        slide_cost = float((weights * slide_kept * squares).sum())
+        slide_cost = np.pad((weights * slide_kept * squares).sum(1), (1, 0))
         if equations is not None:
             local = point_derivative(posed, points, soles.joints, layout.active)
             height_by = np.einsum("i,tpid->tpd", up, local)

@@ -58,6 +58,11 @@ class Surface:
         self.weights = weights / weights.sum(1, keepdims=True)
         self.inner = _spread(body.vertices, INNER)
 
+    def whole(self, state: State, posed: Posed, frame: int) -> Floats:
+        """Positions [V, 3] of all vertices in one frame, in the fit's world."""
+        one, every = posed.part(slice(frame, frame + 1)), np.arange(len(self.weights))[None]
+        return np.einsum("pb,pbi->pi", self.weights, self._parts(one, state.shape, every)[0])
+
     def of_frame(self, state: State, posed: Posed, frame: int) -> tuple[Floats, Floats]:
         """Positions and normals [D, 3] of the dense vertices in one frame, in the fit's world."""
         one = posed.part(slice(frame, frame + 1))
@@ -117,6 +122,13 @@ class Surface:
         return np.asarray(
             posed.joints[frames, bones] + np.einsum("tpbij,tpbj->tpbi", posed.world[frames, bones], lever)
         )
+
+
+def spaced(pixels: Floats, usable: Ints, cell: float, count: int, rng: np.random.Generator) -> Ints:
+    """Up to ``count`` of the indices ``usable`` of ``pixels`` [P, 2], one in each ``cell`` px."""
+    known = rng.permutation(usable)
+    _, first = np.unique(np.floor(pixels[known] / cell), axis=0, return_index=True)
+    return rng.permutation(known[first])[:count]
 
 
 def _spread(points: Floats, count: int) -> Ints:

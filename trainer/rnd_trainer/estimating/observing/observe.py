@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
 from rnd_trainer.estimating.flow import flow_of
-from rnd_trainer.estimating.observations import Masks, Observations
+from rnd_trainer.estimating.observations import GreyImages, Observations, only_person
 
 from .detection import Detector
 from .hands import HandNetwork, Hands
@@ -80,7 +80,7 @@ def observe(
     start = find_person(video, numbers, networks.detector, networks.landmarks, person)
     frames: list[int] = []
     first: list[Views] = []
-    soft = Masks([], (video.width, video.height))
+    soft = GreyImages([], (video.width, video.height))
     for done, (number, views) in enumerate(follow(video, numbers, start, networks.detector, networks.landmarks)):
         if views is not None:
             frames.append(number)
@@ -89,12 +89,14 @@ def observe(
         on_progress("landmarks", done + 1, len(numbers))
     if len(frames) < MIN_FRAMES:
         raise InputError("frames with the person in view", expected=f"at least {MIN_FRAMES}", got=len(frames))
-    masks = Masks([], soft.image_size)
+    masks, person_alone = GreyImages([], soft.image_size), GreyImages([], soft.image_size)
     refined = refine_masks(lambda k: video.frame(frames[k]), soft, lambda k, n: on_progress("masks", k, n))
     second, outside = [], []
     for k, mask in enumerate(refined):
+        image = video.frame(frames[k])
         masks.append(mask)
-        alone = _alone(video.frame(frames[k]), mask, first[k].region.size)
+        person_alone.append(only_person(image, mask))
+        alone = _alone(image, mask, first[k].region.size)
         views = networks.landmarks.look_twice(alone, first[k].region.scaled(_WIDER))
         second.append(views.without_mask())
         outside.append(_outside(mask, np.concatenate([first[k].points, views.points])))
@@ -114,6 +116,7 @@ def observe(
         hands_confidence=np.stack([hand.confidence for hand in hands]),
         masks=masks,
         flow=flow,
+        person=person_alone,
     )
 
 
