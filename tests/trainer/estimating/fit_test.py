@@ -242,6 +242,25 @@ def parts_of(lifted: Lifted, count: int) -> Lifted:
     return Lifted(*(getattr(lifted, name)[:count] for name in names))
 
 
+def test_a_frame_out_of_place_is_told_by_what_others_show(person):
+    few, lifted = person[0].select(np.arange(8)), parts_of(person[1], 8)
+    fit = Fit(few, lifted, default_figure(), _lens(few, FOCAL, None), None)
+    for _ in range(8):
+        fit.advance(Stage(1, surface=True))
+    astray, aside_m = 3, 0.02
+    gaps = []
+    for shift in (0.0, aside_m):
+        translations = fit.state.translations.copy()
+        translations[astray, 0] += shift
+        state = replace(fit.state, translations=translations)
+        posed = state.posed(fit.figure)
+        term = appearance_term(fit.surface, state, posed, fit.lens, few.person, 1.0)
+        seen = fit.surface.seen(state, posed, fit.lens, term.vertices).pixels
+        gaps.append(np.median((term.pixels - seen)[astray, term.inverse[astray] > 0], axis=0))
+    pixels = aside_m * FOCAL / -fit.state.posed(fit.figure).joints[astray, 0, 2]
+    np.testing.assert_allclose(gaps[1] - gaps[0], [-pixels, 0], atol=0.25 * pixels)
+
+
 def test_flow_over_more_frames_than_there_are_says_nothing(person):
     few, lifted = person[0].select(np.arange(4)), parts_of(person[1], 4)
     few = replace(few, flow=(Flow(8, np.zeros((0, 4)), np.zeros((0, CELLS, CELLS, 2), np.float16)),))
