@@ -12,7 +12,8 @@ from scipy.ndimage import gaussian_filter1d
 from rnd_runtime.capture.body import posed_vertices
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
-from rnd_trainer.estimating.fit import Fit, Stage, Weights, _lens, estimate
+from rnd_trainer.estimating.fit import Fit, _lens, estimate
+from rnd_trainer.estimating.fit_settings import Stage, Weights
 from rnd_trainer.estimating.fitting.appearance import appearance_term
 from rnd_trainer.estimating.fitting.figure import default_figure
 from rnd_trainer.estimating.fitting.kinematics import attached, pose

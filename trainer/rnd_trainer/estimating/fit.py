@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import Motion
 
+from .fit_settings import COMPARISON, CONVERGED, STAGES, WEIGHTS, Stage, Weights
 from .fitting.appearance import AppearanceTerm, appearance_term
 from .fitting.figure import Figure, default_figure, known_figure
 from .fitting.image_motion import FlowTerm
@@ -46,53 +48,6 @@ CORRELATION = 3.5
 """errors of neighbouring frames and points are alike: measured errors over deviations that take them as independent"""
 _LESS_SURE = ((TRUNK, 1.5), (FACE, 1.3), (FINGERS, 1.5))  # factors of their deviation
 _START_SHARE = 0.1  # weight of face and fingers for the first positions
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Factors of the terms, without a unit, and the standard deviations that the terms assume."""
-
-    mark_m: float = 0.022  # deviation of a sure landmark at the person's distance, m
-    spread: float = 1.0  # share of the distance between one frame's views that counts as deviation
-    points: float = 2.0  # factor of the landmarks
-    bones: float = 0.2  # factor of the lifter's directions
-    limbs: float = 0.105  # deviation of its limbs and rolls from the body's, beside its own, rad
-    trunk: float = 0.21  # likewise of its trunk; rigs differ, rad
-    prior: float = 0.03  # factor of the prior of poses
-    smooth: float = 0.1  # factor of smoothness
-    acceleration: float = 4.0  # deviation of the trunk's along each axis, m/s²; limbs two to three times that
-    spin: float = 20.0  # deviation of the joints' angular acceleration, rad/s²; factors by joint as above
-    still: float = 1.0  # factor of joints that keep still
-    outline: float = 0.5  # factor of the mask's outline against the body's
-    inner: float = 0.15  # factor of body points that lie outside of the mask
-    outline_m: float = 0.012  # deviation of outlines at the person's distance, m
-    flow: float = 0.5  # factor of the surface's motion in the image
-    appearance: float = 1.0  # factor of the surface's places by what it looks like in other frames
-    ground: float = 1.0  # factor of feet on the ground
-    slide: float = 0.03  # factor of standing feet that move
-    shared: float = 0.1  # share of the frames that count as independent, in the weight of shape and focal length
-
-
-@dataclass(frozen=True)
-class Stage:
-    """Steps of the fit with some terms."""
-
-    steps: int
-    surface: bool = False  # the terms of outlines and flow
-    appearance: bool = False  # what the stage's first pose looks like in other frames
-    points: float = 1.0
-    limit: float = 3.0
-
-
-CONVERGED = 1e-3
-"""relative fall of the cost below which a stage ends"""
-STAGES = (
-    Stage(8, points=0.3, limit=8.0),
-    Stage(10, limit=5.0),
-    Stage(14, surface=True),
-    Stage(5, surface=True, appearance=True),
-    Stage(5, surface=True, appearance=True),
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +86,7 @@ def estimate(
     height: float | None = None,
     focal_px: float | None = None,
     principal_px: tuple[float, float] | None = None,
-    weights: Weights = Weights(),
+    weights: Weights = WEIGHTS,
     on_progress: OnProgress = lambda done, total: None,
 ) -> Estimate:
     """Fit a body to all frames of ``observations`` at once.
@@ -160,19 +115,16 @@ def estimate(
     if len(lifted) != count:
         raise InputError("lifted bones", expected=f"{count} frames", got=len(lifted))
     fit = Fit(observations, lifted, figure, _lens(observations, focal_px, principal_px), height, weights)
-    total = sum(stage.steps for stage in STAGES)
-    done = 0
+    total, done = sum(stage.length for stage in STAGES), 0
     for stage in STAGES:
-        cost = np.inf
-        fit.begin(stage)
-        for number in range(stage.steps):
-            before, cost = cost, fit.advance(stage)
-            on_progress(done + number + 1, total)
-            if number >= 2 and cost > before * (1 - CONVERGED):
-                break
-        done += stage.steps
+        fit.run(stage, partial(_report, on_progress, done, total))
+        done += stage.length
         on_progress(done, total)
     return fit.result()
+
+
+def _report(on_progress: OnProgress, done: int, total: int, steps: float) -> None:
+    on_progress(done + steps, total)
 
 
 def _lens(observations: Observations, focal_px: float | None, principal_px: tuple[float, float] | None) -> Lens:
@@ -193,7 +145,7 @@ class Fit:
         figure: Figure,
         lens: Lens,
         height: float | None,
-        weights: Weights = Weights(),
+        weights: Weights = WEIGHTS,
     ) -> None:
         self.observations, self.lifted, self.figure, self.lens = observations, lifted, figure, lens
         self.height, self.weights = height, weights
@@ -307,13 +259,23 @@ class Fit:
             cost += term(state, posed, layout, lens, equations)
         return cost
 
-    def begin(self, stage: Stage) -> None:
+    def run(self, stage: Stage, on_steps: Callable[[float], None]) -> None:
+        """All steps of a stage, until its cost hardly falls; ``on_steps`` is called with how many are done."""
+        self._compare(stage, lambda share: on_steps(COMPARISON * share))
+        cost = np.inf
+        for number in range(stage.steps):
+            before, cost = cost, self.advance(stage)
+            on_steps(stage.length - stage.steps + number + 1)
+            if number >= 2 and cost > before * (1 - CONVERGED):
+                break
+
+    def _compare(self, stage: Stage, on_share: Callable[[float], None]) -> None:
         """Compare frames with each other, if ``stage`` needs that, in the pose so far."""
-        person = self.observations.person
+        person, weight = self.observations.person, self.weights.appearance
         self._appearance = ()
         if stage.appearance and person is not None:
             posed = self.state.posed(self.figure)
-            term = appearance_term(self.surface, self.state, posed, self.lens, person, self.weights.appearance)
+            term = appearance_term(self.surface, self.state, posed, self.lens, person, weight, on_share)
             self._appearance = (term,)
 
     def advance(self, stage: Stage) -> float:

@@ -5,6 +5,7 @@ Flow tells how the surface moves from frame to frame; this tells where it is, by
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -105,7 +106,13 @@ class View:
 
 
 def appearance_term(
-    surface: Surface, state: State, posed: Posed, lens: Lens, images: GreyImages, weight: float
+    surface: Surface,
+    state: State,
+    posed: Posed,
+    lens: Lens,
+    images: GreyImages,
+    weight: float,
+    on_progress: Callable[[float], None] = lambda share: None,
 ) -> AppearanceTerm:
     """The term of a body posed roughly right, from ``images`` of the person, 0 elsewhere."""
     frames = len(posed)
@@ -127,6 +134,7 @@ def appearance_term(
         here = slice(0, len(chosen))
         term.vertices[k, here], term.pixels[k, here] = vertices[chosen], pixels[chosen] + moved[chosen]
         term.inverse[k, here] = 1 / np.hypot(_DEVIATION_PX / view.scale, _DEVIATION_M * metre[k])
+        on_progress((k + 1) / frames)
     return term
 
 
