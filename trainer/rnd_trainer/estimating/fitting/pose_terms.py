@@ -28,9 +28,8 @@ STILL_DRIFT = 0.013
 """rad/√s, of a joint that keeps still"""
 STILL_RATE = 0.3
 """rad/s; a joint that usually turns so fast drifts twice as far"""
-COLLAR = 0.35
-"""rotation of a collar to its arm's: the lifter, whose bones end at the shoulders, sees arms move but not collars"""
-_TRUNK = ("spine1", "spine2", "spine3", "neck", "head")  # turn together
+COLLAR = 0.5
+"""rotation of a collar to its arm's (Inman et al. 1944), which the lifter hardly sees"""
 
 
 def right_jacobian_inverse(vectors: Floats) -> Floats:
@@ -173,8 +172,6 @@ class StillTerm:
         rates = np.linalg.norm(_steps(rotations), axis=-1) / seconds[:, None]
         around = max(1, round(AROUND_SECONDS / float(np.median(seconds))))
         usual = median_filter(rates, (around, 1), mode="nearest")
-        trunk = [names.index(name) for name in _TRUNK]
-        usual[:, trunk] = usual[:, trunk].max(1, keepdims=True)
         for side in ("left", "right"):
             collar, shoulder = names.index(f"{side}_collar"), names.index(f"{side}_shoulder")
             usual[:, collar] = np.maximum(usual[:, collar], COLLAR * usual[:, shoulder])
