@@ -240,8 +240,8 @@ class Fit:
         outline: OutlineTerm | None,
         images: Sequence[FlowTerm | AppearanceTerm] = (),
         equations: NormalEquations | None = None,
-    ) -> Floats:
-        """Costs [T] of ``state`` by frame, what all share spread evenly; adds its derivatives to ``equations``."""
+    ) -> float:
+        """Cost of ``state``; adds its derivatives to ``equations``."""
         figure, marks, layout, lens, w = self.figure, self.marks, self.layout, self.lens, self.weights
         posed = state.posed(figure)
         cost = points(state, posed, figure, marks, layout, lens, equations)
@@ -251,13 +251,12 @@ class Fit:
         cost += self._smooth(posed, layout, equations)
         cost += self._still(posed, layout, equations)
         cost += GroundTerm(self.times, w.ground, w.slide)(state, posed, figure, marks, layout, equations)
-        shared = SharedTerm(lens, 1 + w.shared * len(posed), self.height)
-        cost += shared(state, figure, marks, layout, equations) / len(posed)
+        cost += SharedTerm(lens, 1 + w.shared * len(state.translations), self.height)(
+            state, figure, marks, layout, equations
+        )
         if outline is not None:
             cost += outline(state, posed, layout, lens, equations)
-        for term in images:
-            cost += term(state, posed, layout, lens, equations)
-        return cost
+        return cost + sum(term(state, posed, layout, lens, equations) for term in images)
 
     def run(self, stage: Stage, on_steps: Callable[[float], None]) -> None:
         """All steps of a stage, until its cost hardly falls; ``on_steps`` is called with how many are done."""
@@ -286,13 +285,13 @@ class Fit:
         reach = max([2, *(flow.gap for flow in flows)])
         equations = NormalEquations(len(self.observations), self.layout.unknowns, self.layout.shared, reach)
         images: list[FlowTerm | AppearanceTerm] = [*flows, *self._appearance]
-        before = float(self.evaluate(self.state, points, outline, images, equations).sum())
+        before = self.evaluate(self.state, points, outline, images, equations)
         for _ in range(4):
             local, shared = equations.solve(self.damping)
             turn = np.clip(local[:, :-3], -MAX_TURN, MAX_TURN)
             local = np.concatenate([turn, np.clip(local[:, -3:], -MAX_SHIFT, MAX_SHIFT)], 1)
             state = self.layout.moved(self.state, local, shared)
-            after = float(self.evaluate(state, points, outline, images).sum())
+            after = self.evaluate(state, points, outline, images)
             if after <= before:
                 self.state, self.damping = state, max(self.damping * 0.3, 1e-5)
                 break

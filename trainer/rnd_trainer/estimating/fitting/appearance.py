@@ -66,7 +66,7 @@ class AppearanceTerm:
 
     def __call__(
         self, state: State, posed: Posed, layout: Layout, lens: Lens, equations: NormalEquations | None
-    ) -> Floats:
+    ) -> float:
         seen = self.surface.seen(state, posed, lens, self.vertices)
         residual = (seen.pixels - self.pixels) * self.inverse[..., None]
         cost, kept = robust((residual**2).sum(-1), self.limit)

@@ -67,7 +67,7 @@ class FlowTerm:
 
     def __call__(
         self, state: State, posed: Posed, layout: Layout, lens: Lens, equations: NormalEquations | None
-    ) -> Floats:
+    ) -> float:
         ends = [posed.part(slice(0, -self.gap)), posed.part(slice(self.gap, None))]
         first, last = (self.surface.seen(state, end, lens, self.vertices) for end in ends)
         residual = (last.pixels - first.pixels - self.displacement) * self.inverse[..., None]
@@ -82,4 +82,4 @@ class FlowTerm:
             ]
             weight = self.weight * np.repeat(kept, 2, axis=1)
             equations.add_chain(residual.reshape(count, -1), weight, parts, self.gap)
-        return np.pad(self.weight * cost, (0, self.gap))
+        return self.weight * cost

@@ -51,15 +51,16 @@ class PriorTerm:
     weight: float = 0.05
     limit_deviation: float = 0.08  # rad past straight
 
-    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> Floats:
+    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> float:
         names = posed.skeleton.names
         order = [names.index(name) for name in JOINTS[1:]]
         columns = [int(np.flatnonzero(layout.active == k)[0]) for k in order]
         vectors = matrix_to_axis_angle(posed.rotations[:, order])  # [T, 21, 3]
         count = len(vectors)
         residual = (vectors.reshape(count, -1) - self.prior.mean) @ self.prior.whiten.T
+        cost = self.weight * float((residual**2).sum())
         hinge, signs = self._hinges(vectors)
-        cost = self.weight * (residual**2).sum(1) + (hinge**2).sum(1)
+        cost += float((hinge**2).sum())
         if equations is not None:
             turn = right_jacobian_inverse(vectors)
             local = np.zeros((count, residual.shape[1], layout.unknowns))
@@ -100,9 +101,9 @@ class SmoothTerm:
     weight: float = 1.0
     limit: float = 4.0
 
-    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> Floats:
+    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> float:
         if len(posed) < 3:
-            return np.zeros(len(posed))
+            return 0.0
         before, after = np.diff(self.times)[:-1], np.diff(self.times)[1:]
         first, last = 2 / (before * (before + after)), 2 / (after * (before + after))
         factors = np.stack([first, -first - last, last], 1)[:, :, None, None]  # [T − 2, 3, 1, 1]
@@ -126,7 +127,7 @@ class SmoothTerm:
             weight = self.weight * np.repeat(kept, 3, axis=1)
             equations.add_chain(residual.reshape(count, -1), weight, parts)
             self._add_spin(equations, steps, span, middle, spin, spin_kept, layout)
-        return np.pad(self.weight * (cost + spin_cost), 1)
+        return self.weight * (cost + spin_cost)
 
     def _add_spin(
         self,
@@ -178,7 +179,7 @@ class StillTerm:
         drift = STILL_DRIFT * (1 + (usual / STILL_RATE) ** 3)
         return cls(drift * np.sqrt(seconds)[:, None], weight)
 
-    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> Floats:
+    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> float:
         active = layout.active
         steps = _steps(posed.rotations[:, active])
         scale = ((active != 0) / self.steps[:, active])[..., None]
@@ -189,7 +190,7 @@ class StillTerm:
             parts = [_of_each_joint(scale[..., None] * block, layout.unknowns) for block in (backward, forward)]
             weight = self.weight * np.repeat(kept, 3, axis=1)
             equations.add_chain(residual.reshape(len(residual), -1), weight, parts)
-        return np.pad(self.weight * cost, (1, 0))
+        return self.weight * cost
 
 
 def _steps(rotations: Floats) -> Floats:
@@ -226,7 +227,7 @@ class GroundTerm:
         marks: Marks,
         layout: Layout,
         equations: NormalEquations | None,
-    ) -> Floats:
+    ) -> float:
         chosen = np.array(FEET)
         soles = _part(marks, chosen)
         places = soles.places + np.tensordot(state.shape, soles.basis, 1)
@@ -238,14 +239,14 @@ class GroundTerm:
         kept = np.where(heights < self.reach_m * 3, kept, 0)
         below = np.where(heights < 0, 1.0, 0.0)
         sunk = np.minimum(heights, 0) / self.height_m
-        cost += (sunk**2).sum(1)
+        cost += float((sunk**2).sum())
         standing = np.exp(-0.5 * np.maximum(heights, 0) ** 2 / self.reach_m**2)
         span = np.diff(self.times)[:, None, None]
         slide = np.diff(points, axis=0) / span / self.slip
         weights = np.minimum(standing[1:], standing[:-1])
         squares = (slide**2).sum(-1)
         slide_kept = 1 / (1 + squares / (self.moving / self.slip) ** 2)
-        slide_cost = np.pad((weights * slide_kept * squares).sum(1), (1, 0))
+        slide_cost = float((weights * slide_kept * squares).sum())
         if equations is not None:
             local = point_derivative(posed, points, soles.joints, layout.active)
             height_by = np.einsum("i,tpid->tpd", up, local)

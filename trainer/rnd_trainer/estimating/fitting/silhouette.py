@@ -126,7 +126,7 @@ class OutlineTerm:
 
     def __call__(
         self, state: State, posed: Posed, layout: Layout, lens: Lens, equations: NormalEquations | None
-    ) -> Floats:
+    ) -> float:
         found = self.matches >= 0
         vertices = np.maximum(self.matches, 0)
         cost = self._across(state, posed, layout, lens, vertices, found, equations)
@@ -141,7 +141,7 @@ class OutlineTerm:
         vertices: Ints,
         found: NDArray[np.bool_],
         equations: NormalEquations | None,
-    ) -> Floats:
+    ) -> float:
         seen = self.surface.seen(state, posed, lens, vertices)
         gap = seen.pixels - self.outlines.points
         inverse = 1 / self.deviation[:, None]
@@ -150,7 +150,7 @@ class OutlineTerm:
         squares = residual**2
         kept = 1 / (1 + squares / self.limit**2)
         weight = self.weight * far * found
-        cost = (weight * squares * kept).sum(1)
+        cost = float((weight * squares * kept).sum())
         if equations is not None:
             across = self.outlines.normals * inverse[..., None]
             equations.add(residual, weight * kept**2, *self._across_image(seen, posed, layout, lens, across))
@@ -158,7 +158,7 @@ class OutlineTerm:
 
     def _inside(
         self, state: State, posed: Posed, layout: Layout, lens: Lens, equations: NormalEquations | None
-    ) -> Floats:
+    ) -> float:
         vertices = np.broadcast_to(self.surface.inner, (len(posed), len(self.surface.inner)))
         seen = self.surface.seen(state, posed, lens, vertices)
         value, slope = self._sample(seen.pixels)

@@ -1,4 +1,4 @@
-"""The terms of the fit: each returns its robust costs [T] by frame and adds its derivatives to the normal equations.
+"""The terms of the fit: each returns its robust cost and adds its derivatives to the normal equations.
 
 Residuals are in deviations, so that costs of all terms add. ``Geman-McClure``: ρ(r²) = r² / (1 + r²/c²).
 """
@@ -23,10 +23,10 @@ Floats = NDArray[np.float64]
 LIMBS = tuple(f"{side}_{name}" for side in ("left", "right") for name in ("knee", "ankle", "elbow", "wrist"))
 
 
-def robust(squares: Floats, limit: float) -> tuple[Floats, Floats]:
-    """Geman-McClure costs [N] of squared residuals [N, P], and the weights [N, P] of their least squares."""
+def robust(squares: Floats, limit: float) -> tuple[float, Floats]:
+    """Geman-McClure cost of squared residuals and the weights of their least squares."""
     kept = 1 / (1 + squares / limit**2)
-    return (squares * kept).sum(1), kept * kept
+    return float((squares * kept).sum()), kept * kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class PointTerm:
         layout: Layout,
         lens: Lens,
         equations: NormalEquations | None,
-    ) -> Floats:
+    ) -> float:
         points = mark_points(state, posed, marks)
         pixels, by_point = project(points, state, lens)
         inverse = 1 / self.deviation
@@ -124,7 +124,7 @@ class BoneTerm:
 
     def __call__(
         self, state: State, posed: Posed, figure: Figure, layout: Layout, equations: NormalEquations | None
-    ) -> Floats:
+    ) -> float:
         names, rest = posed.skeleton.names, figure.body.skeleton.rest_joints
         index = np.array([names.index(name) for name in JOINTS])
         parents = index[np.array(PARENTS[1:])]
@@ -133,7 +133,7 @@ class BoneTerm:
         limbs = np.array([name in LIMBS for name in JOINTS[1:]])
         axes = np.where(limbs[:, None], own, REST_DIRECTIONS)
         beside = np.where(limbs, self.limbs, self.trunk)
-        cost = np.zeros(len(posed))
+        cost = 0.0
         for joints, axis, target, kappa, other in (
             (parents, axes, self.lifted.directions, self.lifted.concentration, beside),
             (index[1:], ROLL_AXES, self.lifted.roll, self.lifted.roll_concentration, self.limbs),
