@@ -178,19 +178,22 @@ def _alike(one: Floats32, shown: Floats32, allowed: NDArray[np.bool_]) -> NDArra
     return found[np.unique(np.linspace(0, len(found) - 1, min(len(found), OTHERS)).round().astype(int))]
 
 
-def _moved(view: View, others: list[View], faces: NDArray[np.int64], points: Floats) -> Floats:
-    """How far ``points`` [P, 2] px of the posed body are from where the image has them [P, 2]; NaN where unknown."""
-    moved = np.full(points.shape, np.nan)
+def _elsewhere(view: View, others: list[View], faces: NDArray[np.int64]) -> tuple[Floats32, NDArray[np.bool_]]:
+    """Grey levels [h, w] that ``others`` show of the faces at each pixel, and where two or more of them do."""
     total, weight = np.zeros(view.grey.shape), np.zeros(view.grey.shape)
     count = np.zeros(view.grey.shape, np.int64)
     for other in others:
         _add_other(
             view.nearest, faces, view.points, other.points, other.depth, other.grey, other.facing, total, weight, count
         )
-    known = (count >= 2) & (view.grey > 0)
-    if not known.any():
-        return moved
-    wanted = np.where(known, total / np.maximum(weight, 1e-9), 0).astype(np.float32)
+    return (total / np.maximum(weight, 1e-9)).astype(np.float32), count >= 2
+
+
+def _moved(view: View, others: list[View], faces: NDArray[np.int64], points: Floats) -> Floats:
+    """How far ``points`` [P, 2] px of the posed body are from where the image has them [P, 2]; NaN where unknown."""
+    wanted, known = _elsewhere(view, others, faces)
+    known &= view.grey > 0
+    wanted *= known
     grey = np.where(known, view.grey, 0).astype(np.float32)
     around = (cv2.blur(image, (_EVEN_PX, _EVEN_PX)) for image in (grey, wanted))  # both know the same pixels
     wanted *= np.clip(np.divide(*(np.maximum(image, 1) for image in around)), 0.3, 3)
@@ -200,6 +203,7 @@ def _moved(view: View, others: list[View], faces: NDArray[np.int64], points: Flo
     usable = (inside > 0) & (texture(first) > _TEXTURE)
     cells = np.floor(points).astype(np.int64)
     height, width = view.grey.shape
+    moved = np.full(points.shape, np.nan)
     column, row = np.clip(cells, 0, [width - 1, height - 1]).T
     chosen = np.flatnonzero((cells == np.stack([column, row], 1)).all(1) & usable[row, column])
     if not len(chosen):
