@@ -20,15 +20,15 @@ SECONDS = (1 / 15, 2 / 15)
 """times over which flow is measured; in shorter ones its errors are as large as the motion"""
 MAX_GAP = 8
 """frames, at most; the fit's equations grow with its square"""
-_SIDE = 512  # px of the longer side of the images compared
-_ZOOM = 2.0  # of small people, at most
+SIDE = 512  # px of the longer side of the images compared
+ZOOM = 2.0  # of small people, at most
 _MARGIN = 0.04  # of the person's longer side, around it
 _GAP = 0.003  # of that side: forwards and back may differ by it,
 _GAP_SHARE = 0.05  # and by this share of the way
-_TEXTURE = 1.5  # least root-mean-square slope along any direction, grey levels a pixel; less is guessed
+TEXTURE = 1.5  # least root-mean-square slope along any direction, grey levels a pixel; less is guessed
 _WINDOW = 4.0  # px, deviation of the window in which texture is measured
 _MAX_ERROR = 1.0  # px, after refinement
-_LUCAS_KANADE: dict[str, Any] = {
+LUCAS_KANADE: dict[str, Any] = {
     "winSize": (9, 9),
     "maxLevel": 0,
     "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01),
@@ -107,7 +107,7 @@ def _between(first: tuple[Image, Image], second: tuple[Image, Image]) -> tuple[N
     margin = round(_MARGIN * side)
     left, top = max(columns.min() - margin, 0), max(rows.min() - margin, 0)
     right, bottom = min(columns.max() + 1 + margin, width), min(rows.max() + 1 + margin, height)
-    scale = min(_ZOOM, _SIDE / max(right - left, bottom - top))
+    scale = min(ZOOM, SIDE / max(right - left, bottom - top))
     size = max(1, round((right - left) * scale)), max(1, round((bottom - top) * scale))
     parts = [
         cv2.resize(image[top:bottom, left:right], size, interpolation=cv2.INTER_AREA)
@@ -120,7 +120,7 @@ def _between(first: tuple[Image, Image], second: tuple[Image, Image]) -> tuple[N
     place = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in size)), -1)
     allowed = _GAP * side * scale
     gap = np.linalg.norm(there + _moved(back, place + there), axis=-1)
-    known = (mask > 127) & (_moved(next_mask, place + there) > 127) & (texture(grey) > _TEXTURE / max(scale, 1))
+    known = (mask > 127) & (_moved(next_mask, place + there) > 127) & (texture(grey) > TEXTURE / max(scale, 1))
     known &= gap < allowed + _GAP_SHARE * np.linalg.norm(there, axis=-1)
     columns, rows = (np.minimum(((np.arange(CELLS) + 0.5) / CELLS * n).astype(int), n - 1) for n in size)
     cells = np.ix_(rows, columns)
@@ -138,7 +138,7 @@ def _refined(first: Image, second: Image, points: Floats32, moved: Floats32, all
     """
     if not len(points):
         return moved
-    ends, gap = tracked(first, second, points, points + moved, **_LUCAS_KANADE)
+    ends, gap = tracked(first, second, points, points + moved, **LUCAS_KANADE)
     way = ends - points
     good = gap < np.minimum(allowed + _GAP_SHARE * np.linalg.norm(way, axis=1), _MAX_ERROR)
     return np.asarray(np.where(good[:, None], way, np.nan), np.float32)

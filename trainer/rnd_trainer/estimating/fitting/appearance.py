@@ -15,37 +15,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_trainer.checking.silhouette import z_buffer
-from rnd_trainer.estimating.flow import texture, tracked
+from rnd_trainer.estimating.flow import LUCAS_KANADE, SIDE, TEXTURE, ZOOM, texture, tracked
 from rnd_trainer.estimating.observations import GreyImages
 
 from .kinematics import Posed
 from .normal_equations import NormalEquations
 from .state import Layout, State
-from .surface import FACING, Ints, Surface, spaced
+from .surface import FACING, POINTS, Ints, Surface, spaced
 from .terms import Lens, project, robust
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Floats32 = NDArray[np.float32]
 
-POINTS = 150
-"""points compared in a frame, at most"""
 KEY_FRAMES = 64
 """frames that others are compared with, at most"""
 OTHERS = 12
 """of these, for one frame"""
-_SIDE = 512  # px of the longer side of the person's images,
-_ZOOM = 2.0  # enlarged at most
 _SAME_M = 0.05  # depth within which a point is the one that another frame shows
 _SHARED = 0.5  # least share of a frame's faces that another should show too
-_CELL_M = 0.05  # one point in each cell of so many metres at the person's distance
 _EVEN_PX = 25  # side of the window in which brightness is made equal
-_TEXTURE = 1.5  # least slope along any direction, grey levels a pixel
 _INSIDE_PX = 3  # from the rim of what is compared
 _MAX_GAP = 1.5  # px between a point and where it ends, followed there and back
 _DEVIATION_PX, _DEVIATION_M = 0.5, 0.008
 _COARSE: dict[str, Any] = {"winSize": (21, 21), "maxLevel": 1}
-_FINE: dict[str, Any] = {"winSize": (9, 9), "maxLevel": 0}
 _MAX_CHANGE = 3.0  # px, from the coarse window's answer to the fine one's
 
 
@@ -130,7 +123,7 @@ def appearance_term(
         others = keys[_alike(_shown(view, len(faces)), shown, keys != k)]
         vertices, pixels = surface.visible(state, posed, lens, k)
         moved = _moved(view, [views[int(other)] for other in others], faces, view.to_image(pixels)) / view.scale
-        chosen = spaced(pixels, np.flatnonzero(np.isfinite(moved).all(1)), _CELL_M * metre[k], POINTS, rng)
+        chosen = spaced(pixels, np.flatnonzero(np.isfinite(moved).all(1)), metre[k], rng)
         here = slice(0, len(chosen))
         term.vertices[k, here], term.pixels[k, here] = vertices[chosen], pixels[chosen] + moved[chosen]
         term.inverse[k, here] = 1 / np.hypot(_DEVIATION_PX / view.scale, _DEVIATION_M * metre[k])
@@ -146,7 +139,7 @@ def _view(
         rows, columns = (np.array([0, side - 1]) for side in image.shape)
     top, left = rows.min(), columns.min()
     cut = image[top : rows.max() + 1, left : columns.max() + 1]
-    scale = min(_ZOOM, _SIDE / max(cut.shape))
+    scale = min(ZOOM, SIDE / max(cut.shape))
     width, height = (max(1, round(side * scale)) for side in cut.shape[::-1])
     within = cv2.resize(np.where(cut > 0, np.uint8(255), np.uint8(0)), (width, height), interpolation=cv2.INTER_AREA)
     grey = cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA)
@@ -200,7 +193,7 @@ def _moved(view: View, others: list[View], faces: NDArray[np.int64], points: Flo
     first, second = (np.clip(image, 0, 255).astype(np.uint8) for image in (wanted, grey))
     reach = 2 * _INSIDE_PX + 1
     inside = cv2.erode(known.astype(np.uint8), np.ones((reach, reach), np.uint8), borderValue=0)
-    usable = (inside > 0) & (texture(first) > _TEXTURE)
+    usable = (inside > 0) & (texture(first) > TEXTURE)
     cells = np.floor(points).astype(np.int64)
     height, width = view.grey.shape
     moved = np.full(points.shape, np.nan)
@@ -210,7 +203,7 @@ def _moved(view: View, others: list[View], faces: NDArray[np.int64], points: Flo
         return moved
     start = (points[chosen] - 0.5).astype(np.float32)
     rough, rough_gap = tracked(first, second, start, start, **_COARSE)
-    ends, gap = tracked(first, second, start, rough, **_FINE)
+    ends, gap = tracked(first, second, start, rough, **LUCAS_KANADE)
     good = (rough_gap < 2 * _MAX_GAP) & (gap < _MAX_GAP) & (np.linalg.norm(ends - rough, axis=1) < _MAX_CHANGE)
     moved[chosen[good]] = (ends - start)[good]
     return moved

@@ -16,14 +16,11 @@ from rnd_trainer.estimating.flow import Flow
 from .kinematics import Posed
 from .normal_equations import NormalEquations
 from .state import Layout, State
-from .surface import Ints, Surface, spaced
+from .surface import POINTS, Ints, Surface, spaced
 from .terms import Lens, robust
 
 Floats = NDArray[np.float64]
 
-POINTS = 150
-"""points compared in a frame, at most"""
-_CELL_M = 0.05  # one point in each cell of so many metres at the person's distance
 _DEVIATION_PX, _DEVIATION_M = 0.5, 0.0025  # of measured flow,
 _SHARE = 0.05  # and as a share of the way
 
@@ -58,7 +55,7 @@ class FlowTerm:
         displacement, inverse = np.zeros((pairs, POINTS, 2)), np.zeros((pairs, POINTS))
         for k, (found, pixels) in enumerate(visible[:pairs]):
             moved = flow.at(k, pixels)
-            chosen = spaced(pixels, np.flatnonzero(np.isfinite(moved).all(1)), _CELL_M * scale[k], POINTS, rng)
+            chosen = spaced(pixels, np.flatnonzero(np.isfinite(moved).all(1)), scale[k], rng)
             count = len(chosen)
             vertices[k, :count], displacement[k, :count] = found[chosen], moved[chosen]
             way = np.linalg.norm(moved[chosen], axis=1)

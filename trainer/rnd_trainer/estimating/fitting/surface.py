@@ -19,9 +19,12 @@ BONES = 3
 """bones of a vertex that are followed"""
 INNER = 120
 """vertices far from each other, tested against the mask"""
+POINTS = 150
+"""points compared with the image in a frame, at most"""
 FACING = 0.3
 """cosine to the line of sight above which a vertex faces the camera"""
 _CELL_M = 0.03  # of the grid in which nearer vertices hide others, at the person's distance
+_SPACING_M = 0.05  # one point in each cell of that size at the person's distance
 _THICKNESS_M = 0.10  # vertices so far behind the nearest are hidden
 
 
@@ -60,14 +63,12 @@ class Surface:
 
     def whole(self, state: State, posed: Posed, frame: int) -> Floats:
         """Positions [V, 3] of all vertices in one frame, in the fit's world."""
-        one, every = posed.part(slice(frame, frame + 1)), np.arange(len(self.weights))[None]
-        return np.einsum("pb,pbi->pi", self.weights, self._parts(one, state.shape, every)[0])
+        return self._positions(state, posed, frame, np.arange(len(self.weights)))
 
     def of_frame(self, state: State, posed: Posed, frame: int) -> tuple[Floats, Floats]:
         """Positions and normals [D, 3] of the dense vertices in one frame, in the fit's world."""
-        one = posed.part(slice(frame, frame + 1))
+        points = self._positions(state, posed, frame, self.dense)
         weights, bones = self.weights[self.dense], self.bones[self.dense]
-        points = np.einsum("pb,pbi->pi", weights, self._parts(one, state.shape, self.dense[None])[0])
         turn = np.einsum("pb,pbij->pij", weights, posed.world[frame][bones])
         return points, np.einsum("pij,pj->pi", turn, self.normals[self.dense])
 
@@ -111,6 +112,11 @@ class Surface:
         shared[..., layout.focal] = seen.pixels - lens.centre
         return shared
 
+    def _positions(self, state: State, posed: Posed, frame: int, vertices: Ints) -> Floats:
+        """Positions [P, 3] of ``vertices`` [P] in one frame."""
+        parts = self._parts(posed.part(slice(frame, frame + 1)), state.shape, vertices[None])[0]
+        return np.asarray(np.einsum("pb,pbi->pi", self.weights[vertices], parts))
+
     def _parts(self, posed: Posed, shape: Floats, vertices: Ints) -> Floats:
         """Positions [T, P, BONES, 3] of ``vertices`` [T, P] as each of their bones moves them."""
         rest = self.figure.body.vertices[vertices] + np.tensordot(
@@ -124,11 +130,11 @@ class Surface:
         )
 
 
-def spaced(pixels: Floats, usable: Ints, cell: float, count: int, rng: np.random.Generator) -> Ints:
-    """Up to ``count`` of the indices ``usable`` of ``pixels`` [P, 2], one in each ``cell`` px."""
+def spaced(pixels: Floats, usable: Ints, metre: float, rng: np.random.Generator) -> Ints:
+    """Up to ``POINTS`` of the indices ``usable`` of ``pixels`` [P, 2], ``metre`` px a metre; one in each small cell."""
     known = rng.permutation(usable)
-    _, first = np.unique(np.floor(pixels[known] / cell), axis=0, return_index=True)
-    return rng.permutation(known[first])[:count]
+    _, first = np.unique(np.floor(pixels[known] / (_SPACING_M * metre)), axis=0, return_index=True)
+    return rng.permutation(known[first])[:POINTS]
 
 
 def _spread(points: Floats, count: int) -> Ints:
