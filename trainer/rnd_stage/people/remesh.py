@@ -162,8 +162,9 @@ class _Mesh:
         return list({(min(p), max(p)) for f in self.faces if f for p in (f[:2], f[1:], (f[2], f[0]))})
 
     def _length(self, a: int, b: int) -> float:
+        """Of an edge, to the nanometre: below that CPUs differ, and equal edges would be sorted by chance."""
         x, y, z = self.points[a] - self.points[b]
-        return (x * x + y * y + z * z) ** 0.5
+        return round((x * x + y * y + z * z) ** 0.5, 9)
 
     def _size(self, a: int, b: int) -> float:
         return 0.5 * (self.sizes[a] + self.sizes[b])
