@@ -38,8 +38,8 @@ OnProgress = Callable[[float, float], None]
 
 MIN_FRAMES = 12
 """fewer frames tell too little of the body"""
-FOCAL_OF_SIDE = 1.1
-"""usual focal length over the image's longer side: phones film at 0.8 to 1.6"""
+USUAL_FOCAL = 1.4
+"""focal length over the image's shorter side: phones film 16:9 at 0.7 to 0.9 of the longer; crops keep the shorter"""
 FOCAL_DEVIATION = 0.20
 KNOWN_FOCAL_DEVIATION = 0.003
 MAX_TURN, MAX_SHIFT = 0.5, 0.4
@@ -132,7 +132,7 @@ def _lens(observations: Observations, focal_px: float | None, principal_px: tupl
     centre = np.array(principal_px if principal_px is not None else (width / 2, height / 2), np.float64)
     if focal_px is not None:
         return Lens(centre, float(np.log(focal_px)), KNOWN_FOCAL_DEVIATION)
-    return Lens(centre, float(np.log(FOCAL_OF_SIDE * max(width, height))), FOCAL_DEVIATION)
+    return Lens(centre, float(np.log(USUAL_FOCAL * min(width, height))), FOCAL_DEVIATION)
 
 
 class Fit:

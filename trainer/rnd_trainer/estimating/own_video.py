@@ -31,8 +31,7 @@ from rnd_trainer.importing.write import write_capture
 from rnd_trainer.training.poses.uncertainty import PoseUncertainty, save_uncertainty
 
 from .film_notes import cut_off, film_notes, refuse_unusable
-from .fit import FOCAL_OF_SIDE, Estimate, estimate
-from .lifter import lift
+from .fit import Estimate, estimate
 from .observations import Observations
 from .observing.camera_motion import Steady, steady
 from .observing.frame_rate import Regular, regular
@@ -132,17 +131,13 @@ def _frames(source: Path, options: ImportOptions) -> tuple[Any, list[int]]:
 
 
 def _fitted(seen: Observations, options: ImportOptions, on_progress: OnProgress) -> Estimate:
-    width, height = seen.image_size
-    focal = options.intrinsics[0] if options.intrinsics else FOCAL_OF_SIDE * max(width, height)
-    principal = options.intrinsics[2:] if options.intrinsics else (width / 2, height / 2)
-    lifted = lift(seen, focal, (principal[0], principal[1]))
+    lens = options.intrinsics
     return estimate(
         seen,
-        lifted,
         body=None if options.body is None else load_body_model(options.body).shaped(None),
         height=options.height,
-        focal_px=focal if options.intrinsics else None,
-        principal_px=(principal[0], principal[1]),
+        focal_px=lens[0] if lens else None,
+        principal_px=(lens[2], lens[3]) if lens else None,
         on_progress=lambda done, total: on_progress("fitting the body", int(done), int(total)),
     )
 
