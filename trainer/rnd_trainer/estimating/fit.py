@@ -109,12 +109,12 @@ def estimate(
     if focal_px is not None and not (np.isfinite(focal_px) and focal_px > 0):
         raise InputError("focal length", expected="a positive number of pixels", got=focal_px)
     figure = default_figure() if body is None else known_figure(body) if isinstance(body, Body) else body
+    lens = _lens(observations, focal_px, principal_px)
     if lifted is None:
-        lens = _lens(observations, focal_px, principal_px)
         lifted = lift(observations, float(np.exp(lens.log_focal)), lens.centre)
     if len(lifted) != count:
         raise InputError("lifted bones", expected=f"{count} frames", got=len(lifted))
-    fit = Fit(observations, lifted, figure, _lens(observations, focal_px, principal_px), height, weights)
+    fit = Fit(observations, lifted, figure, lens, height, weights)
     total, done = sum(stage.length for stage in STAGES), 0
     for stage in STAGES:
         fit.run(stage, partial(_report, on_progress, done, total))
