@@ -117,6 +117,19 @@ def test_no_sun_is_below_the_floor(monkeypatch) -> None:
     assert below.max() < 4 * below.mean()
 
 
+def test_no_sun_is_where_it_hardly_reaches_what_is_seen(monkeypatch) -> None:
+    """From behind a ball it touches a rim alone, which errors of outlines can explain as well at any strength."""
+    sun = np.array([0.0, 0.5, -0.866])
+    ball, peaks = rotating_ball(sun, 60.0), []
+    monkeypatch.setattr(light_search, "observe", lambda *_: ball)
+    for least in (0.0, light_search.MIN_REACH):
+        monkeypatch.setattr(light_search, "MIN_REACH", least)
+        found = initial_light(None, [], [])  # type: ignore[arg-type]  # the observations are given
+        assert found is not None
+        peaks.append(found.radiance.max() / found.radiance.mean())
+    assert peaks[0] > 100 and peaks[1] < 4
+
+
 def test_the_sun_keeps_its_strength_under_texture_and_wrong_shadows(monkeypatch) -> None:
     """Noise of 30 % on colours, a quarter of the shade twice as bright; least squares alone lose 23 % of the sun."""
     sun = np.array([0.7, 0.5, 0.51]) / np.linalg.norm([0.7, 0.5, 0.51])

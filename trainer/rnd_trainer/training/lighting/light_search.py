@@ -61,6 +61,9 @@ below which there is none; of several lights their share. The weakest true ones 
 real videos, whose bodies and poses err, one that is not there has up to 4.1e-3"""
 MIN_GAIN = 0.01
 """decrease by every further one, relative to the squared error; of several lights their share"""
+MIN_REACH = 0.02
+"""mean of visibility and cosine over the observations, below which a direction is no light: one behind a person who
+never turned would get any strength"""
 NOISE_FLOOR = 2e-3
 """squared error relative to the energy at which the search ends; that of real captures is ten times as large"""
 CANDIDATES = 24
@@ -128,6 +131,7 @@ def initial_light(
     coarse_directions, coarse_angles = _grid(SEARCH_SHAPE)
     coarse = transport_of(observations, coarse_directions, coarse_angles)
     exposure = _exposure(observations, coarse) / _upsampled(coarse_angles) * solid_angles
+    possible = (coarse_directions[:, 1] > 0) & (coarse.mean(0) > MIN_REACH * coarse_angles / np.pi)
     hidden = np.maximum(1 - coarse.sum(1), 0)
     coarse = with_bounce(coarse, hidden)
     blocks, skies = observations.blocks, SKY_LOBES * observations.lights
@@ -138,8 +142,7 @@ def initial_light(
     advance()
     if quadratic.is_undetermined():
         return None
-    above = coarse_directions[:, 1] > 0
-    found = (np.array(_search(quadratic, above, above), int) - skies) % (2 * len(coarse_directions))
+    found = (np.array(_search(quadratic, possible, possible), int) - skies) % (2 * len(coarse_directions))
     advance()
     windows = np.unique(found[found >= len(coarse_directions)]) - len(coarse_directions)
     near_texels = _texels_near(directions, coarse_directions[found[found < len(coarse_directions)]])
@@ -148,7 +151,7 @@ def initial_light(
     maps = np.zeros((len(near_texels) + len(windows), len(directions)))  # radiance of each column after the sky's
     maps[np.arange(len(near_texels)), near_texels] = 1
     maps[len(near_texels) :] = _lobes(directions, coarse_directions[windows], WINDOW_SHARPNESS).T
-    chosen = _search(_quadratic(observations, columns, weight), directions[near_texels, 1] > 0, above[windows])
+    chosen = _search(_quadratic(observations, columns, weight), _upsampled(possible)[near_texels], possible[windows])
     advance()
     intensity = _intensities(observations, columns[:, [*range(skies), *chosen]])
     advance()
@@ -275,7 +278,7 @@ def _intensities(observations: Observations, columns: NDArray[np.float32]) -> Fl
 def _search(quadratic: Quadratic, suns: NDArray[np.bool_], windows: NDArray[np.bool_]) -> list[int]:
     """Columns of suns and windows, in the order in which they are added.
 
-    ``suns`` and ``windows`` tell which of those of each light, its columns after the sky's, are above the horizon.
+    ``suns`` and ``windows`` tell which of those of each light, its columns after the sky's, are possible.
     Errors blur, so a window must explain much more than a sun does, and as much as a first one must.
 
     Without shadows a direction and its opposite have similar gradients: above degree 1 the SH coefficients of a cosine
