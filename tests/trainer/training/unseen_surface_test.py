@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -10,8 +12,38 @@ from rnd_runtime.capture.capture import load_capture
 from rnd_trainer.config import ModelConfig
 from rnd_trainer.model.model import AvatarModel
 from rnd_trainer.model.template import sample_template
-from rnd_trainer.training.unseen_surface import SEEN, fill_in
+from rnd_trainer.render.render import splat
+from rnd_trainer.training.unseen_surface import SEEN, evidence, fill_in
+from support.ball import front_camera, splat_ball
 from support.paths import ASSETS
+
+
+class Ball:
+    """A model that is a ball in any pose."""
+
+    posed = splat_ball()
+    points = posed.means
+    spacing = torch.tensor(0.011)  # m: √(4π RADIUS² / 4000)
+
+    def __call__(self, pose: object) -> object:
+        return self.posed
+
+
+def test_evidence_is_the_share_of_a_patch_that_images_show() -> None:
+    view = SimpleNamespace(camera=front_camera())
+    seen = evidence(Ball(), [view, view], [None, None])  # type: ignore[arg-type]
+    towards = np.array(view.camera.position) - Ball.points.numpy()
+    cosine = (Ball.posed.normals.numpy() * towards).sum(1) / np.linalg.norm(towards, axis=1)
+    assert seen[cosine < -0.2].max() == 0  # unlit
+    shares = [seen[abs(cosine - c) < 0.1].mean() / 2 for c in (0.9, 0.5)]
+    np.testing.assert_allclose(shares, (0.9, 0.5), rtol=0.3)  # splats reach beyond their patch
+    one = int(np.argmax(seen))
+    red = torch.zeros(len(seen), 3)
+    red[one, 0] = 1
+    pixels = float(splat(Ball.posed, red, view.camera).image[..., 0].sum())
+    depth = float(-(view.camera.world_to_camera @ [*Ball.points[one].tolist(), 1])[2])
+    patch = (view.camera.K[0, 0] * float(Ball.spacing) / depth) ** 2
+    assert seen[one] == pytest.approx(2 * pixels / patch, rel=1e-4)
 
 
 @pytest.fixture

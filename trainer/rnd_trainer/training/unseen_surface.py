@@ -1,8 +1,9 @@
 """Albedo and roughness of surface that the images hardly show, filled in from what resembles it.
 
-The evidence e of a Gaussian is the sum of n·v over the images in which it is in sight. Raw attributes a of those below
-``SEEN`` minimise Σ_i e_i (a_i − ã_i)² + λ Σ_ij (a_i − a_j)², ã as learned, over pairs of neighbours on the surface and
-of Gaussians that mirror each other; all others stay (screened Poisson equation).
+The evidence e of a Gaussian is its weight in the pixels of all images, in pixels that its share of the surface covers
+when seen from the front. Raw attributes a of those below ``SEEN`` minimise Σ_i e_i (a_i − ã_i)² + λ Σ_ij (a_i − a_j)²,
+ã as learned, over pairs of neighbours on the surface and of Gaussians that mirror each other; all others stay (screened
+Poisson equation).
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from scipy.spatial import cKDTree
 
 from rnd_runtime.core.arrays import spaced_indices
 from rnd_trainer.model.model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
-from rnd_trainer.render.in_sight import in_sight
+from rnd_trainer.render.render import splat
+from rnd_trainer.render.shading import visible_towards
 
 from .data import TrainingView
 
@@ -32,23 +34,22 @@ NEIGHBOURS = 6
 """on the surface"""
 IMAGES = 40
 """evenly spaced, among which Gaussians are looked for"""
-FACING, OCCLUSION = 0.2, 0.015
-"""smallest n·v, and distance behind the first surface in m, of a Gaussian in sight"""
 
 
 def evidence(model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[PoseInput]) -> Floats:
     """Evidence [N] of every Gaussian, scaled to all of ``views``."""
-    count = len(model.points)
-    total = np.zeros(count)
+    total = np.zeros(len(model.points))
     chosen = spaced_indices(len(views), IMAGES)
     for index in chosen:
         camera = views[index].camera
         with torch.no_grad():
             posed = model(poses[index])
-        visible = in_sight(posed, camera, count, facing=FACING, occlusion=OCCLUSION).visible
-        means, normals = posed.means.cpu().numpy(), posed.normals.cpu().numpy()
-        towards = camera.position - means
-        total += visible * (normals * towards).sum(1) / np.linalg.norm(towards, axis=1)
+        lit = visible_towards(posed.normals, posed.means, camera)[0].cpu().numpy()
+        shown = torch.zeros_like(posed.means).requires_grad_()
+        (weight,) = torch.autograd.grad(splat(posed, shown, camera).image[..., 0].sum(), shown)
+        _, depth = camera.project(posed.means.cpu().numpy())
+        patch = (camera.K[0, 0] * float(model.spacing) / depth) ** 2
+        total[lit] += (weight[:, 0].cpu().numpy() / patch)[lit]
     return total * len(views) / len(chosen)
 
 

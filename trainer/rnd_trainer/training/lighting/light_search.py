@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -325,7 +326,7 @@ def _exposure(observations: Observations, coarse: NDArray[np.float32]) -> Floats
     return _upsampled(own.T @ coarse / len(coarse))
 
 
-def _upsampled(values: Floats) -> Floats:
+def _upsampled(values: NDArray[Any]) -> NDArray[Any]:
     """Maps [..., 512] of the search's texels, repeated to the probe's [..., 2048]."""
     rows, columns = (fine // coarse for fine, coarse in zip(PROBE_SHAPE, SEARCH_SHAPE, strict=True))
     maps = values.reshape(*values.shape[:-1], *SEARCH_SHAPE).repeat(rows, -2).repeat(columns, -1)
