@@ -223,8 +223,9 @@ class Fit:
             self.outlines = outlines_of(self.observations.masks, len(self.observations), self.observations.image_size)
         posed = self.state.posed(self.figure)
         matches = rim_matches(self.surface, self.state, posed, self.lens, self.outlines)
-        deviation = self.weights.outline_m * self._scale()
-        return OutlineTerm(self.surface, self.outlines, matches, deviation, self.weights.outline, self.weights.inner)
+        w, scale = self.weights, self._scale()
+        beyond = (w.clothes_m if self.figure.names else 0.0) * scale  # a known body has its clothes on
+        return OutlineTerm(self.surface, self.outlines, matches, w.outline_m * scale, beyond, w.outline, w.inner)
 
     def _flow_terms(self) -> list[FlowTerm]:
         posed, scale = self.state.posed(self.figure), self._scale()
