@@ -41,7 +41,7 @@ def test_evidence_is_the_share_of_a_patch_that_images_show() -> None:
     red = torch.zeros(len(seen), 3)
     red[one, 0] = 1
     pixels = float(splat(Ball.posed, red, view.camera).image[..., 0].sum())
-    depth = float(-(view.camera.world_to_camera @ [*Ball.points[one].tolist(), 1])[2])
+    depth = float((view.camera.world_to_camera @ [*Ball.points[one].tolist(), 1])[2])
     patch = (view.camera.K[0, 0] * float(Ball.spacing) / depth) ** 2
     assert seen[one] == pytest.approx(2 * pixels / patch, rel=1e-4)
 

@@ -224,8 +224,8 @@ class Fit:
         posed = self.state.posed(self.figure)
         matches = rim_matches(self.surface, self.state, posed, self.lens, self.outlines)
         w, scale = self.weights, self._scale()
-        beyond = (w.clothes_m if self.figure.names else 0.0) * scale  # a known body has its clothes on
-        return OutlineTerm(self.surface, self.outlines, matches, w.outline_m * scale, beyond, w.outline, w.inner)
+        lengths = w.outline_m * scale, w.beyond_m * scale
+        return OutlineTerm(self.surface, self.outlines, matches, *lengths, w.outline, w.inner)
 
     def _flow_terms(self) -> list[FlowTerm]:
         posed, scale = self.state.posed(self.figure), self._scale()

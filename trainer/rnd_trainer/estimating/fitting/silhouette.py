@@ -113,7 +113,7 @@ class OutlineTerm:
 
     Attributes:
         matches: [T, SAMPLES] vertices, −1 for none.
-        deviation: [T] px; beyond: [T] px from the rim outwards to the outline.
+        deviation: [T] px; beyond: [T] px from those vertices outwards to the outline.
     """
 
     surface: Surface
