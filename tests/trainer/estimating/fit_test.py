@@ -238,18 +238,6 @@ def test_derivatives_agree_with_differences(person, term, part):
     assert (ahead - behind) / (2 * small) == pytest.approx(slope, rel=1e-3, abs=0.05)
 
 
-def test_outlines_are_a_little_outside_of_the_rims_vertices(person):
-    few, lifted = person[0].select(np.arange(4)), parts_of(person[1], 4)
-    lens = _lens(few, FOCAL, None)
-    fit = Fit(few, lifted, default_figure(), lens, None)
-    term = replace(fit._outline_term(), inner_weight=0.0, limit=1e4)
-    posed, bare = fit.state.posed(fit.figure), replace(term, beyond=np.zeros(4))
-    inside = term.outlines.points - term.beyond[:, None, None] * term.outlines.normals
-    moved = replace(bare, outlines=replace(term.outlines, points=inside))
-    costs = [each(fit.state, posed, fit.layout, lens, None) for each in (term, moved, bare)]
-    assert costs[0] == pytest.approx(costs[1], rel=1e-4) != pytest.approx(costs[2], rel=0.05)
-
-
 def parts_of(lifted: Lifted, count: int) -> Lifted:
     names = ("directions", "concentration", "roll", "roll_concentration")
     return Lifted(*(getattr(lifted, name)[:count] for name in names))

@@ -223,9 +223,8 @@ class Fit:
             self.outlines = outlines_of(self.observations.masks, len(self.observations), self.observations.image_size)
         posed = self.state.posed(self.figure)
         matches = rim_matches(self.surface, self.state, posed, self.lens, self.outlines)
-        w, scale = self.weights, self._scale()
-        lengths = w.outline_m * scale, w.beyond_m * scale
-        return OutlineTerm(self.surface, self.outlines, matches, *lengths, w.outline, w.inner)
+        deviation = self.weights.outline_m * self._scale()
+        return OutlineTerm(self.surface, self.outlines, matches, deviation, self.weights.outline, self.weights.inner)
 
     def _flow_terms(self) -> list[FlowTerm]:
         posed, scale = self.state.posed(self.figure), self._scale()

@@ -23,7 +23,6 @@ class Weights:
     outline: float = 0.5  # factor of the mask's outline against the body's
     inner: float = 0.15  # factor of body points that lie outside of the mask
     outline_m: float = 0.012  # deviation of outlines at the person's distance, m
-    beyond_m: float = 0.008  # from the rim's vertices, which lie inside of the rim, to the outline, m
     flow: float = 0.5  # factor of the surface's motion in the image
     appearance: float = 1.0  # factor of the surface's places by what it looks like in other frames
     ground: float = 1.0  # factor of feet on the ground

@@ -113,14 +113,13 @@ class OutlineTerm:
 
     Attributes:
         matches: [T, SAMPLES] vertices, −1 for none.
-        deviation: [T] px; beyond: [T] px from those vertices outwards to the outline.
+        deviation: [T] px.
     """
 
     surface: Surface
     outlines: Outlines
     matches: Ints
     deviation: Floats
-    beyond: Floats
     weight: float = 0.2
     inner_weight: float = 0.2
     limit: float = 4.0
@@ -146,7 +145,7 @@ class OutlineTerm:
         seen = self.surface.seen(state, posed, lens, vertices)
         gap = seen.pixels - self.outlines.points
         inverse = 1 / self.deviation[:, None]
-        residual = ((gap * self.outlines.normals).sum(-1) + self.beyond[:, None]) * inverse
+        residual = (gap * self.outlines.normals).sum(-1) * inverse
         far = 1 / (1 + (gap**2).sum(-1) * inverse**2 / (3 * self.limit) ** 2)  # a match that far is a guess
         squares = residual**2
         kept = 1 / (1 + squares / self.limit**2)
