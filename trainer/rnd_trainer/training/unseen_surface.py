@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from rnd_runtime.core.arrays import spaced_indices
 from rnd_trainer.model.model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
-from rnd_trainer.render.render import splat
+from rnd_trainer.render.raster import rasterize
 from rnd_trainer.render.shading import visible_towards
 
 from .data import TrainingView
@@ -45,8 +45,9 @@ def evidence(model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[
         with torch.no_grad():
             posed = model(poses[index])
         lit = visible_towards(posed.normals, posed.means, camera)[0].cpu().numpy()
-        shown = torch.zeros_like(posed.means).requires_grad_()
-        (weight,) = torch.autograd.grad(splat(posed, shown, camera).image[..., 0].sum(), shown)
+        shown = torch.zeros_like(posed.means[:, :1]).requires_grad_()
+        image, _, _ = rasterize(posed.means, posed.covariances, posed.attributes.opacity, shown, camera)
+        (weight,) = torch.autograd.grad(image.sum(), shown)
         _, depth = camera.project(posed.means.cpu().numpy())
         patch = (camera.K[0, 0] * float(model.spacing) / depth) ** 2
         total[lit] += (weight[:, 0].cpu().numpy() / patch)[lit]

@@ -47,6 +47,18 @@ def _arriving(ball: Observations, sun: np.ndarray) -> np.ndarray:
     return 1 + 6 / math.pi * np.maximum(normals @ sun, 0)
 
 
+def _peaks(monkeypatch, ball: Observations, least: str) -> list[float]:
+    """Largest over mean radiance of the light found, without the bound ``least`` and with it."""
+    monkeypatch.setattr(light_search, "observe", lambda *_: ball)
+    peaks = []
+    for bound in (0.0, getattr(light_search, least)):
+        monkeypatch.setattr(light_search, least, bound)
+        found = initial_light(None, [], [])  # type: ignore[arg-type]  # the observations are given
+        assert found is not None
+        peaks.append(found.radiance.max() / found.radiance.mean())
+    return peaks
+
+
 @pytest.mark.parametrize("strength", [0.0, 6.0])
 def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
     sun = np.array([0.7, 0.5, 0.51])
@@ -77,15 +89,10 @@ def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
 def test_a_first_sun_must_explain_more_than_errors_do(monkeypatch) -> None:
     """On a real video errors of body and poses are explained a little by a sun that is not there."""
     sun = np.array([0.7, 0.5, 0.51]) / np.linalg.norm([0.7, 0.5, 0.51])
-    ball, peaks = rotating_ball(sun, 1.0), []
+    ball = rotating_ball(sun, 1.0)
     ball.colour *= np.exp(0.15 * np.random.default_rng(0).normal(size=(len(ball.colour), 1)))
-    monkeypatch.setattr(light_search, "observe", lambda *_: ball)
-    for least in (0.0, light_search.FIRST_GAIN):
-        monkeypatch.setattr(light_search, "FIRST_GAIN", least)
-        found = initial_light(None, [], [])  # type: ignore[arg-type]  # the observations are given
-        assert found is not None
-        peaks.append(found.radiance.max() / found.radiance.mean())
-    assert peaks[0] > 30 and peaks[1] < 4
+    without, with_it = _peaks(monkeypatch, ball, "FIRST_GAIN")
+    assert without > 30 and with_it < 4
 
 
 def test_a_window_is_found_as_broad_as_it_is(monkeypatch) -> None:
@@ -120,14 +127,8 @@ def test_no_sun_is_below_the_floor(monkeypatch) -> None:
 def test_no_sun_is_where_it_hardly_reaches_what_is_seen(monkeypatch) -> None:
     """From behind a ball it touches a rim alone, which errors of outlines can explain as well at any strength."""
     sun = np.array([0.0, 0.5, -0.866])
-    ball, peaks = rotating_ball(sun, 60.0), []
-    monkeypatch.setattr(light_search, "observe", lambda *_: ball)
-    for least in (0.0, light_search.MIN_REACH):
-        monkeypatch.setattr(light_search, "MIN_REACH", least)
-        found = initial_light(None, [], [])  # type: ignore[arg-type]  # the observations are given
-        assert found is not None
-        peaks.append(found.radiance.max() / found.radiance.mean())
-    assert peaks[0] > 100 and peaks[1] < 4
+    without, with_it = _peaks(monkeypatch, rotating_ball(sun, 60.0), "MIN_REACH")
+    assert without > 100 and with_it < 4
 
 
 def test_the_sun_keeps_its_strength_under_texture_and_wrong_shadows(monkeypatch) -> None:
