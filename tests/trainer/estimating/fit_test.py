@@ -19,6 +19,7 @@ from rnd_trainer.estimating.fitting.figure import default_figure
 from rnd_trainer.estimating.fitting.kinematics import attached, pose
 from rnd_trainer.estimating.fitting.marks import marks_of
 from rnd_trainer.estimating.fitting.normal_equations import NormalEquations
+from rnd_trainer.estimating.fitting.pose_terms import BalanceTerm, _soles
 from rnd_trainer.estimating.fitting.state import TO_CAMERA
 from rnd_trainer.estimating.flow import CELLS, Flow, flow_of
 from rnd_trainer.estimating.lifted import JOINTS, PARENTS, REST_DIRECTIONS, ROLL_AXES, Lifted
@@ -30,10 +31,11 @@ HANGING = 0.8
 SHAPE = {"height": 0.6, "legs": 0.8, "arms": -0.7, "gender": 0.5}
 
 
-def known_person(noise_px: float = 0.7, seed: int = 0, *, held: bool = False):
+def known_person(noise_px: float = 0.7, seed: int = 0, *, held: bool = False, roll: float = 0.0):
     """Observations and bones of a person who turns; true joints [T, 24, 3] m in camera axes; the body.
 
     Who holds the pose turns by half a circle, and the directions of arms are believed to hang when seen from the side.
+    The camera is rolled by ``roll`` rad.
     """
     figure = default_figure()
     shape = np.array([SHAPE.get(name, 0.0) for name in figure.names])
@@ -50,6 +52,10 @@ def known_person(noise_px: float = 0.7, seed: int = 0, *, held: bool = False):
         vectors[:, names.index(f"{side}_knee"), 0] = 0.3
     rotations = axis_angle_to_matrix(vectors)
     translations = np.stack([0.1 * phase, np.full(FRAMES, -1.0), np.full(FRAMES, -3.2)], 1)
+    rolled = axis_angle_to_matrix(np.array([0.0, 0.0, roll]))
+    rotations[:, 0] = rolled @ rotations[:, 0]
+    root = body.skeleton.rest_joints[0]
+    translations = (root + translations) @ rolled.T - root
     posed = pose(body.skeleton, rotations, translations, body.skeleton.rest_joints)
     marks = marks_of(figure)
     places = marks.places + np.tensordot(shape, marks.basis, 1)
@@ -145,6 +151,37 @@ def test_it_recovers_a_known_motion(person):
 
 
 @pytest.mark.slow
+def test_who_stands_tells_how_the_camera_is_rolled():
+    roll = np.radians(20.0)
+    observations, lifted, _, body = known_person(roll=roll)
+    errors = []
+    for balance in (0.0, Weights().balance):
+        weights = replace(Weights(), balance=balance)
+        up = estimate(observations, lifted, body=body, focal_px=FOCAL, weights=weights).camera.world_to_camera[:3, 1]
+        errors.append(abs(np.arctan2(up[0], -up[1]) + roll))
+    assert errors[1] < np.radians(3) and errors[1] < 0.5 * errors[0], np.degrees(errors)
+
+
+def test_who_sits_or_jumps_tells_nothing_of_the_ground(person):
+    observations, lifted = person[:2]
+    fit = Fit(observations, lifted, default_figure(), _lens(observations, FOCAL, None), None)
+    names = fit.figure.body.skeleton.names
+    bent = fit.state.rotations.copy()
+    for side in ("left", "right"):
+        for joint, angle in (("hip", -1.5), ("knee", 1.5)):
+            bent[:, names.index(f"{side}_{joint}")] = axis_angle_to_matrix(np.array([angle, 0.0, 0.0]))
+    sitting = replace(fit.state, rotations=bent)
+    soles = _soles(sitting, sitting.posed(fit.figure), fit.marks)[1][..., 1].min()
+    for state, upright in (
+        (fit.state, True),
+        (replace(sitting, ground=np.array([soles, 0.0, 0.0])), False),
+        (replace(fit.state, ground=fit.state.ground - [0.3, 0.0, 0.0]), False),
+    ):
+        term = BalanceTerm.of(state, state.posed(fit.figure), fit.marks, 1.0)
+        assert (np.median(term.upright) > 0.9) == upright and (term.upright.max() < 0.01) != upright
+
+
+@pytest.mark.slow
 def test_a_pose_that_is_held_is_seen_from_all_sides():
     observations, lifted, truth, body = known_person(held=True)
     observations = replace(observations, fps=5.0, flow=())  # half a turn in three seconds
@@ -197,6 +234,7 @@ def test_what_other_frames_show_mends_what_is_wrong_in_some():
     ("term", "part"),
     [(term, part) for term in ("points", "outlines") for part in ("pose", "root", "shape", "offsets", "focal")]
     + [("appearance", part) for part in ("pose", "root", "shape", "focal")]
+    + [("balance", part) for part in ("pose", "root", "shape", "ground")]
     + [("flow", "pose"), ("flow", "root")],  # flow and smoothness count a pose's part alone
 )
 def test_derivatives_agree_with_differences(person, term, part):
@@ -204,7 +242,8 @@ def test_derivatives_agree_with_differences(person, term, part):
     weights = replace(Weights(), smooth=0.0) if part == "shape" else Weights()
     if term != "points":
         weights = replace(Weights(), points=0, bones=0, prior=0, smooth=0, still=0, shared=0)
-    fit = Fit(few, lifted, default_figure(), _lens(few, 240.0, None), 1.7, replace(weights, ground=0.0, slide=0.0))
+    weights = replace(weights, ground=0.0, slide=0.0, balance=400.0 if term == "balance" else 0.0)
+    fit = Fit(few, lifted, default_figure(), _lens(few, 240.0, None), 1.7, weights)
     points, outline, images = fit._point_term(Stage(1)), None, []
     if term == "outlines":  # wide limits: the weights of far matches are constants of a step
         outline = replace(fit._outline_term(), inner_weight=0.0, limit=1e4)

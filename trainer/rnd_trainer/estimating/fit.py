@@ -21,7 +21,7 @@ from .fitting.image_motion import FlowTerm
 from .fitting.kinematics import Posed
 from .fitting.marks import HAND_MARKS, KNUCKLES, Marks, marks_of
 from .fitting.normal_equations import NormalEquations
-from .fitting.pose_terms import GroundTerm, PriorTerm, SmoothTerm, StillTerm
+from .fitting.pose_terms import BalanceTerm, GroundTerm, PriorTerm, SmoothTerm, StillTerm
 from .fitting.prior import pose_prior
 from .fitting.silhouette import Outlines, OutlineTerm, outlines_of, rim_matches
 from .fitting.start import joint_rotations, local_rotations, root_positions
@@ -159,6 +159,7 @@ class Fit:
         self.state = self._start()
         self._smooth = self._smoothness()
         self._appearance: tuple[AppearanceTerm, ...] = ()
+        self._balance = self._balanced()
         self._still = StillTerm.of(self.times, self.state.rotations, self.figure.body.skeleton.names, weights.still)
 
     def _start(self) -> State:
@@ -218,6 +219,9 @@ class Fit:
         spins = np.array([2.0 if n.split("_")[-1] in (*limb, "hip", "shoulder") else 0.8 for n in names])
         return SmoothTerm(self.times, w.acceleration * factors, w.spin * spins, w.smooth)
 
+    def _balanced(self) -> BalanceTerm:
+        return BalanceTerm.of(self.state, self.state.posed(self.figure), self.marks, self.weights.balance)
+
     def _outline_term(self) -> OutlineTerm:
         if self.outlines is None:
             self.outlines = outlines_of(self.observations.masks, len(self.observations), self.observations.image_size)
@@ -251,6 +255,7 @@ class Fit:
         cost += self._smooth(posed, layout, equations)
         cost += self._still(posed, layout, equations)
         cost += GroundTerm(self.times, w.ground, w.slide)(state, posed, figure, marks, layout, equations)
+        cost += self._balance(state, posed, figure, marks, layout, equations)
         cost += SharedTerm(lens, 1 + w.shared * len(state.translations), self.height)(
             state, figure, marks, layout, equations
         )
@@ -280,6 +285,7 @@ class Fit:
     def advance(self, stage: Stage) -> float:
         """One Gauss-Newton step with the terms of ``stage``; its cost."""
         points = self._point_term(stage)
+        self._balance = self._balanced()
         outline = self._outline_term() if stage.surface else None
         flows = self._flow_terms() if stage.surface else []
         reach = max([2, *(flow.gap for flow in flows)])

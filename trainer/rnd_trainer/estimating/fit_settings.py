@@ -26,6 +26,7 @@ class Weights:
     flow: float = 0.5  # factor of the surface's motion in the image
     appearance: float = 1.0  # factor of the surface's places by what it looks like in other frames
     ground: float = 1.0  # factor of feet on the ground
+    balance: float = 4.0  # factor of the centre of mass above the feet
     slide: float = 0.03  # factor of standing feet that move
     shared: float = 0.1  # share of the frames that count as independent, in the weight of shape and focal length
 

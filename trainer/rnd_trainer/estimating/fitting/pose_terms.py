@@ -1,4 +1,4 @@
-"""The terms of poses by themselves: prior, hinges, smoothness in time, stillness, feet on the ground. See ``terms``."""
+"""The terms of poses by themselves: prior, hinges, smoothness in time, stillness, ground, balance. See ``terms``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rnd_runtime.core.rotations import matrix_to_axis_angle
 from rnd_trainer.estimating.observations import FEET
 
 from .figure import JOINTS, Figure
-from .kinematics import Posed, attached, point_derivative
+from .kinematics import Posed, attached, point_derivative, shape_derivative
 from .marks import Marks
 from .normal_equations import NormalEquations
 from .prior import Prior
@@ -30,6 +30,28 @@ STILL_RATE = 0.3
 """rad/s; a joint that usually turns so fast drifts twice as far"""
 COLLAR = 0.5
 """rotation of a collar to its arm's (Inman et al. 1944), which the lifter hardly sees"""
+
+MASSES = {
+    "pelvis": 0.112,
+    "spine1": 0.08,
+    "spine2": 0.08,
+    "spine3": 0.16,
+    "head": 0.07,
+    "hip": 0.083,
+    "knee": 0.082,
+    "ankle": 0.026,
+    "foot": 0.007,
+    "shoulder": 0.011,
+    "elbow": 0.025,
+    "wrist": 0.014,
+}
+"""share of the body's mass at each joint: segments by their centres of mass (de Leva 1996)"""
+REACH_M = 0.06
+"""m above the ground at which a point of a foot is in the air"""
+SWAY_M = 0.06
+"""m, deviation of the centre of mass from the middle of the feet along each axis, beside that of the feet"""
+LOW_PELVIS, HIGH_PELVIS = 0.70, 0.85
+"""height of the pelvis over that in standing, below which nobody stands and above which one does"""
 
 
 def right_jacobian_inverse(vectors: Floats) -> Floats:
@@ -215,7 +237,6 @@ class GroundTerm:
     weight: float = 1.0  # of heights
     slide_weight: float = 1.0
     height_m: float = 0.025
-    reach_m: float = 0.06  # a point higher is in the air
     slip: float = 0.15  # m/s of a standing foot
     moving: float = 0.8  # m/s; a faster foot does not stand
 
@@ -228,19 +249,16 @@ class GroundTerm:
         layout: Layout,
         equations: NormalEquations | None,
     ) -> float:
-        chosen = np.array(FEET)
-        soles = _part(marks, chosen)
-        places = soles.places + np.tensordot(state.shape, soles.basis, 1)
-        points = attached(posed, soles.joints, places)
+        soles, points = _soles(state, posed, marks)
         up = state.up
         heights = points @ up - state.ground[0]
-        lowest = np.minimum(heights, self.reach_m * 3)
-        cost, kept = robust((lowest / self.height_m) ** 2, self.reach_m / self.height_m)
-        kept = np.where(heights < self.reach_m * 3, kept, 0)
+        lowest = np.minimum(heights, REACH_M * 3)
+        cost, kept = robust((lowest / self.height_m) ** 2, REACH_M / self.height_m)
+        kept = np.where(heights < REACH_M * 3, kept, 0)
         below = np.where(heights < 0, 1.0, 0.0)
         sunk = np.minimum(heights, 0) / self.height_m
         cost += float((sunk**2).sum())
-        standing = np.exp(-0.5 * np.maximum(heights, 0) ** 2 / self.reach_m**2)
+        standing = np.exp(-0.5 * np.maximum(heights, 0) ** 2 / REACH_M**2)
         span = np.diff(self.times)[:, None, None]
         slide = np.diff(points, axis=0) / span / self.slip
         weights = np.minimum(standing[1:], standing[:-1])
@@ -263,6 +281,83 @@ class GroundTerm:
             pair = np.repeat(weights * slide_kept**2, 3, axis=1) * self.slide_weight
             equations.add_chain(slide.reshape(len(slide), -1), pair, by)
         return self.weight * cost + self.slide_weight * slide_cost
+
+
+@dataclass(frozen=True, eq=False)
+class BalanceTerm:
+    """The centre of mass is above the feet of who stands upright; how the ground is tilted follows from that.
+
+    It sways with every movement and is right on average. What is measured in ``of`` counts as constant.
+
+    Attributes:
+        shares: [T, P] of the standing points of the feet in the middle of the support; they sum to 1.
+        inverse: [T] one over the deviation, m⁻¹.
+        upright: [T] 1 for a person who stands, 0 for one who sits, lies or jumps.
+    """
+
+    shares: Floats
+    inverse: Floats
+    upright: Floats
+    weight: float = 1.0
+    limit: float = 3.0
+
+    @classmethod
+    def of(cls, state: State, posed: Posed, marks: Marks, weight: float) -> BalanceTerm:
+        """The term by which feet ``state`` stands on."""
+        soles, points = _soles(state, posed, marks)
+        heights = points @ state.up - state.ground[0]
+        low = np.maximum(heights.min(1), 0)
+        shares = np.exp(-0.5 * np.maximum(heights - low[:, None], 0) ** 2 / REACH_M**2)
+        shares /= shares.sum(1, keepdims=True)
+        middle = np.einsum("tp,tpi->ti", shares, points)
+        spread = (shares * ((points - middle[:, None]) ** 2).sum(-1)).sum(1)
+        standing = posed.rest[0, 1] - soles.places[:, 1].min()
+        pelvis = posed.joints[:, 0] @ state.up - state.ground[0] - low
+        upright = np.clip((pelvis / standing - LOW_PELVIS) / (HIGH_PELVIS - LOW_PELVIS), 0, 1)
+        upright *= np.exp(-0.5 * low**2 / REACH_M**2)
+        return cls(shares, 1 / np.sqrt(SWAY_M**2 + spread / 2), upright, weight)
+
+    def __call__(
+        self,
+        state: State,
+        posed: Posed,
+        figure: Figure,
+        marks: Marks,
+        layout: Layout,
+        equations: NormalEquations | None,
+    ) -> float:
+        soles, points = _soles(state, posed, marks)
+        masses = np.array([MASSES.get(name.split("_")[-1], 0.0) for name in posed.skeleton.names])
+        heavy = np.flatnonzero(masses)
+        masses = masses[heavy] / masses.sum()
+        lever = masses @ posed.joints[:, heavy] - np.einsum("tp,tpi->ti", self.shares, points)  # [T, 3]
+        up = state.up
+        level = np.eye(3)[[0, 2]] - np.outer(up[[0, 2]], up)  # [2, 3]
+        residual = lever @ level.T * self.inverse[:, None]
+        squares = (residual**2).sum(1)
+        kept = 1 / (1 + squares / self.limit**2)
+        if equations is not None:
+            by_mass = point_derivative(posed, posed.joints[:, heavy], heavy, layout.active)
+            by_feet = point_derivative(posed, points, soles.joints, layout.active)
+            local = np.einsum("p,tpid->tid", masses, by_mass) - np.einsum("tp,tpid->tid", self.shares, by_feet)
+            shared = np.zeros((*residual.shape, layout.shared))
+            by_shape = np.einsum("p,tpik->tik", masses, shape_derivative(posed, figure.joint_basis)[:, heavy])
+            by_shape -= np.einsum("tp,tpik->tik", self.shares, marks_by_shape(posed, figure, soles))
+            shared[..., layout.shape] = level @ by_shape
+            for k, axis in ((1, 0), (2, 2)):
+                tilted = up[1] * (np.eye(3)[axis] - up * up[axis])
+                moved = (lever @ tilted)[:, None] * up + (lever @ up)[:, None] * tilted
+                shared[..., layout.ground.start + k] = -moved[:, [0, 2]]
+            inverse = self.inverse[:, None, None]
+            weight = self.weight * np.repeat((self.upright * kept**2)[:, None], 2, axis=1)
+            equations.add(residual, weight, level @ local * inverse, shared * inverse)
+        return self.weight * float((self.upright * squares * kept).sum())
+
+
+def _soles(state: State, posed: Posed, marks: Marks) -> tuple[Marks, Floats]:
+    """The points of heels and toes, and where they are [T, P, 3]."""
+    soles = _part(marks, np.array(FEET))
+    return soles, attached(posed, soles.joints, soles.places + np.tensordot(state.shape, soles.basis, 1))
 
 
 def _part(marks: Marks, chosen: NDArray[np.int64]) -> Marks:
