@@ -20,7 +20,9 @@ from rnd_trainer.estimating.fitting.kinematics import attached, pose
 from rnd_trainer.estimating.fitting.marks import marks_of
 from rnd_trainer.estimating.fitting.normal_equations import NormalEquations
 from rnd_trainer.estimating.fitting.pose_terms import BalanceTerm, _soles
+from rnd_trainer.estimating.fitting.silhouette import INSET_M, outlines_of
 from rnd_trainer.estimating.fitting.state import TO_CAMERA
+from rnd_trainer.estimating.fitting.terms import project
 from rnd_trainer.estimating.flow import CELLS, Flow, flow_of
 from rnd_trainer.estimating.lifted import JOINTS, PARENTS, REST_DIRECTIONS, ROLL_AXES, Lifted
 from rnd_trainer.estimating.observations import GreyImages, Observations, only_person
@@ -299,6 +301,26 @@ def test_a_frame_out_of_place_is_told_by_what_others_show(person):
         gaps.append(np.median((term.pixels - seen)[astray, term.inverse[astray] > 0], axis=0))
     pixels = aside_m * FOCAL / -fit.state.posed(fit.figure).joints[astray, 0, 2]
     np.testing.assert_allclose(gaps[1] - gaps[0], [-pixels, 0], atol=0.25 * pixels)
+
+
+def test_outlines_lie_so_far_outside_of_the_vertices_they_are_matched_with(person):
+    observations, lifted = person[:2]
+    wide = 4 * SIZE
+    fit = Fit(observations, lifted, default_figure(), _lens(observations, FOCAL, None), None)
+    fit.state = replace(fit.state, log_focal=fit.state.log_focal + np.log(4))
+    fit.lens = replace(fit.lens, centre=4 * fit.lens.centre)
+    posed = fit.state.posed(fit.figure)
+    masks = []
+    for frame in range(FRAMES):
+        pixels, _ = project(fit.surface.whole(fit.state, posed, frame), fit.state, fit.lens)
+        masks.append(np.zeros((wide, wide), np.uint8))
+        for triangle in (pixels[fit.figure.body.faces] * 16).astype(np.int32):
+            cv2.fillConvexPoly(masks[-1], triangle, 255, shift=4)
+    fit.outlines = outlines_of(masks, FRAMES, (wide, wide))
+    term = fit._outline_term()
+    seen = fit.surface.seen(fit.state, posed, fit.lens, np.maximum(term.matches, 0)).pixels
+    inside = ((term.outlines.points - seen) * term.outlines.normals).sum(-1) / fit._scale()[:, None]
+    assert inside[term.matches >= 0].mean() == pytest.approx(INSET_M, abs=0.002)
 
 
 def test_flow_over_more_frames_than_there_are_says_nothing(person):

@@ -23,7 +23,7 @@ from .fitting.marks import HAND_MARKS, KNUCKLES, Marks, marks_of
 from .fitting.normal_equations import NormalEquations
 from .fitting.pose_terms import BalanceTerm, GroundTerm, PriorTerm, SmoothTerm, StillTerm
 from .fitting.prior import pose_prior
-from .fitting.silhouette import Outlines, OutlineTerm, outlines_of, rim_matches
+from .fitting.silhouette import INSET_M, Outlines, OutlineTerm, outlines_of, rim_matches
 from .fitting.start import joint_rotations, local_rotations, root_positions
 from .fitting.state import TO_CAMERA, Layout, State
 from .fitting.surface import Surface
@@ -227,8 +227,10 @@ class Fit:
             self.outlines = outlines_of(self.observations.masks, len(self.observations), self.observations.image_size)
         posed = self.state.posed(self.figure)
         matches = rim_matches(self.surface, self.state, posed, self.lens, self.outlines)
-        deviation = self.weights.outline_m * self._scale()
-        return OutlineTerm(self.surface, self.outlines, matches, deviation, self.weights.outline, self.weights.inner)
+        w, scale = self.weights, self._scale()
+        return OutlineTerm(
+            self.surface, self.outlines, matches, w.outline_m * scale, INSET_M * scale, w.outline, w.inner
+        )
 
     def _flow_terms(self) -> list[FlowTerm]:
         posed, scale = self.state.posed(self.figure), self._scale()

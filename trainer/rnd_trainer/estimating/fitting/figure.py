@@ -84,8 +84,10 @@ PARAMETERS: dict[str, _Stretch] = {
     ),
 }
 HEIGHT_DEVIATION = 0.055
-CLOTHES_M = 0.010
-"""mean thickness and deviation of clothes over the body, m: the parameter "clothes" is 0 at the mean"""
+CLOTHES_M, DRESSED_CLOTHES_M = 0.018, 0.010
+"""mean thickness of clothes, m, over a naked body and over a known one, which may wear some already: the parameter
+"clothes" is 0 there"""
+CLOTHES_DEVIATION_M = 0.010
 BUST_M = 0.014  # m, half of the difference of the sexes
 
 
@@ -122,9 +124,9 @@ class Figure:
 def known_figure(body: Body) -> Figure:
     """``body`` as it is, in clothes of unknown thickness."""
     check_joints(body)
-    clothes = _clothes(body)
-    dressed = replace(body, vertices=body.vertices + clothes)
-    return Figure(dressed, ("clothes",), clothes[None], np.zeros((1, len(body.skeleton), 3)))
+    cover = _cover(body)
+    dressed = replace(body, vertices=body.vertices + DRESSED_CLOTHES_M * cover)
+    return Figure(dressed, ("clothes",), CLOTHES_DEVIATION_M * cover[None], np.zeros((1, len(body.skeleton), 3)))
 
 
 def check_joints(body: Body) -> None:
@@ -144,11 +146,11 @@ def figure_of(body: Body) -> Figure:
         names.append(name)
         flesh.append(moved + (_bust(body) if name == "sex" else 0.0))
         bones.append(shifted)
-    clothes = _clothes(body)
+    cover = _cover(body)
     names.append("clothes")
-    flesh.append(clothes)
+    flesh.append(CLOTHES_DEVIATION_M * cover)
     bones.append(np.zeros_like(joints))
-    dressed = replace(body, vertices=vertices + clothes)
+    dressed = replace(body, vertices=vertices + CLOTHES_M * cover)
     return Figure(dressed, tuple(names), np.stack(flesh), np.stack(bones))
 
 
@@ -212,9 +214,9 @@ def vertex_normals(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
-def _clothes(body: Body) -> Floats:
-    """Movement [V, 3] m of the surface under clothes of mean thickness; none on head and hands."""
+def _cover(body: Body) -> Floats:
+    """Movement [V, 3] of the surface by a metre of clothes; none on head and hands."""
     names = body.skeleton.names
     bare = [k for k, name in enumerate(names) if name == "head" or name.endswith(_HAND)]
     covered = 1 - body.skinning_weights[:, bare].sum(1)
-    return CLOTHES_M * covered[:, None] * vertex_normals(body.vertices, body.faces)
+    return covered[:, None] * vertex_normals(body.vertices, body.faces)

@@ -26,6 +26,8 @@ GRID = 160
 """px of the longer side of the distance map"""
 RIM = 0.35
 """cosine to the line of sight below which a vertex is on the rim"""
+INSET_M = 0.004
+"""m from such vertices outwards to the outline, on average"""
 NORMAL_M = 0.09
 """m that two opposite normals count as in the search for the nearest rim vertex, times ½"""
 
@@ -109,17 +111,18 @@ def rim_matches(surface: Surface, state: State, posed: Posed, lens: Lens, outlin
 
 @dataclass(frozen=True, eq=False)
 class OutlineTerm:
-    """Outline points lie on the rim, across it; points of the body lie inside the mask.
+    """Outline points lie just outside of the rim's vertices, across it; points of the body lie inside the mask.
 
     Attributes:
         matches: [T, SAMPLES] vertices, −1 for none.
-        deviation: [T] px.
+        deviation, inset: [T] px; vertices are so far inside.
     """
 
     surface: Surface
     outlines: Outlines
     matches: Ints
     deviation: Floats
+    inset: Floats
     weight: float = 0.2
     inner_weight: float = 0.2
     limit: float = 4.0
@@ -145,7 +148,7 @@ class OutlineTerm:
         seen = self.surface.seen(state, posed, lens, vertices)
         gap = seen.pixels - self.outlines.points
         inverse = 1 / self.deviation[:, None]
-        residual = (gap * self.outlines.normals).sum(-1) * inverse
+        residual = ((gap * self.outlines.normals).sum(-1) + self.inset[:, None]) * inverse
         far = 1 / (1 + (gap**2).sum(-1) * inverse**2 / (3 * self.limit) ** 2)  # a match that far is a guess
         squares = residual**2
         kept = 1 / (1 + squares / self.limit**2)
