@@ -271,8 +271,7 @@ class GroundTerm:
             shared = np.zeros((*heights.shape, layout.shared))
             shared[..., layout.shape] = np.einsum("i,tpik->tpk", up, marks_by_shape(posed, figure, soles))
             shared[..., layout.ground.start] = -1
-            for k, axis in ((1, 0), (2, 2)):
-                shared[..., layout.ground.start + k] = points[..., axis] - up[axis] * (points @ up)
+            shared[..., layout.ground.start + 1 : layout.ground.stop] = up[1] * points @ _level(up).T
             scale = 1 / self.height_m
             weight = self.weight * (kept + below)
             equations.add(heights * scale, weight, height_by * scale, shared * scale)
@@ -332,8 +331,9 @@ class BalanceTerm:
         masses = masses[heavy] / masses.sum()
         lever = masses @ posed.joints[:, heavy] - np.einsum("tp,tpi->ti", self.shares, points)  # [T, 3]
         up = state.up
-        level = np.eye(3)[[0, 2]] - np.outer(up[[0, 2]], up)  # [2, 3]
-        residual = lever @ level.T * self.inverse[:, None]
+        level = _level(up)
+        aside = lever @ level.T  # [T, 2]
+        residual = aside * self.inverse[:, None]
         squares = (residual**2).sum(1)
         kept = 1 / (1 + squares / self.limit**2)
         if equations is not None:
@@ -344,14 +344,17 @@ class BalanceTerm:
             by_shape = np.einsum("p,tpik->tik", masses, shape_derivative(posed, figure.joint_basis)[:, heavy])
             by_shape -= np.einsum("tp,tpik->tik", self.shares, marks_by_shape(posed, figure, soles))
             shared[..., layout.shape] = level @ by_shape
-            for k, axis in ((1, 0), (2, 2)):
-                tilted = up[1] * (np.eye(3)[axis] - up * up[axis])
-                moved = (lever @ tilted)[:, None] * up + (lever @ up)[:, None] * tilted
-                shared[..., layout.ground.start + k] = -moved[:, [0, 2]]
+            over = (lever @ up)[:, None, None] * level[:, [0, 2]] + up[[0, 2]][:, None] * aside[:, None]
+            shared[..., layout.ground.start + 1 : layout.ground.stop] = -up[1] * over
             inverse = self.inverse[:, None, None]
             weight = self.weight * np.repeat((self.upright * kept**2)[:, None], 2, axis=1)
             equations.add(residual, weight, level @ local * inverse, shared * inverse)
         return self.weight * float((self.upright * squares * kept).sum())
+
+
+def _level(up: Floats) -> Floats:
+    """X and Z without their part along ``up`` [2, 3]; times ``up[1]``, d up / d the ground's two slopes."""
+    return np.eye(3)[[0, 2]] - np.outer(up[[0, 2]], up)
 
 
 def _soles(state: State, posed: Posed, marks: Marks) -> tuple[Marks, Floats]:
