@@ -248,7 +248,7 @@ def test_derivatives_agree_with_differences(person, term, part):
     fit = Fit(few, lifted, default_figure(), _lens(few, 240.0, None), 1.7, weights)
     tilted = replace(fit.state, ground=np.array([0.0, 0.5, -0.4]))
     low = (_soles(tilted, tilted.posed(fit.figure), fit.marks)[1] @ tilted.up).min()
-    fit.state = replace(tilted, ground=tilted.ground + [low, 0.0, 0.0])
+    fit.state = replace(tilted, ground=np.array([low, 0.5, -0.4]))
     fit._balance = fit._balanced()
     points, outline, images = fit._point_term(Stage(1)), None, []
     if term == "outlines":  # wide limits: the weights of far matches are constants of a step
