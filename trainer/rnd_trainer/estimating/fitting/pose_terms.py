@@ -289,7 +289,7 @@ class BalanceTerm:
     It sways with every movement and is right on average. What is measured in ``of`` counts as constant.
 
     Attributes:
-        shares: [T, P] of the standing points of the feet in the middle of the support; they sum to 1.
+        shares: [T, P] of the points of the feet in the middle of the support; they sum to 1.
         inverse: [T] one over the deviation, m⁻¹.
         upright: [T] 1 for a person who stands, 0 for one who sits, lies or jumps.
     """
@@ -302,7 +302,7 @@ class BalanceTerm:
 
     @classmethod
     def of(cls, state: State, posed: Posed, marks: Marks, weight: float) -> BalanceTerm:
-        """The term by which feet ``state`` stands on."""
+        """The term for the feet that ``state`` stands on."""
         soles, points = _soles(state, posed, marks)
         heights = points @ state.up - state.ground[0]
         low = np.maximum(heights.min(1), 0)
