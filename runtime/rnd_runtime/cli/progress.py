@@ -17,7 +17,9 @@ Item = TypeVar("Item")
 INTERVAL = 30.0
 """seconds between two lines where stderr is no terminal"""
 _WINDOW = 60.0
-"""seconds over which the speed is estimated"""
+"""seconds over which the speed is estimated,"""
+_REPORTS = 20
+"""and reports at least: one may have waited for something else"""
 
 
 class Progress:
@@ -85,7 +87,7 @@ class Progress:
             return
         now = time.monotonic()
         self._seen.append((now, done))
-        while len(self._seen) > 1 and self._seen[1][0] < now - _WINDOW:
+        while len(self._seen) > _REPORTS and self._seen[1][0] < now - _WINDOW:
             self._seen.popleft()
         if now >= self._next:
             self._next = now + INTERVAL

@@ -44,6 +44,15 @@ def test_a_resumed_phase_does_not_count_what_was_done_before(clock, capsys):
     assert "95/100 · 50 s left" in capsys.readouterr().err
 
 
+def test_a_pause_between_two_steps_does_not_count_for_all_that_are_left(clock, capsys):
+    with Progress() as bar:
+        bar.phase("training", 100)
+        for done in range(1, 51):
+            clock[0] += 300 if done == 50 else 1
+            bar.update(done)
+    assert capsys.readouterr().err.splitlines()[-1].endswith("50/100 · 14 min left")  # 318 s for 19 steps
+
+
 def test_the_first_item_does_not_count_for_the_time_left(clock, capsys):
     """It compiles kernels and fills caches."""
     for number in track("rendering", range(4), 4):
