@@ -159,7 +159,6 @@ class Fit:
         self.state = self._start()
         self._smooth = self._smoothness()
         self._appearance: tuple[AppearanceTerm, ...] = ()
-        self._balance = self._balanced()
         self._still = StillTerm.of(self.times, self.state.rotations, self.figure.body.skeleton.names, weights.still)
 
     def _start(self) -> State:
@@ -219,8 +218,9 @@ class Fit:
         spins = np.array([2.0 if n.split("_")[-1] in (*limb, "hip", "shoulder") else 0.8 for n in names])
         return SmoothTerm(self.times, w.acceleration * factors, w.spin * spins, w.smooth)
 
-    def _balanced(self) -> BalanceTerm:
-        return BalanceTerm.of(self.state, self.state.posed(self.figure), self.marks, self.weights.balance)
+    def _balance_term(self) -> BalanceTerm:
+        posed = self.state.posed(self.figure)
+        return BalanceTerm.of(self.figure, self.marks, self.state, posed, self.weights.balance)
 
     def _outline_term(self) -> OutlineTerm:
         if self.outlines is None:
@@ -244,7 +244,7 @@ class Fit:
         state: State,
         points: PointTerm,
         outline: OutlineTerm | None,
-        images: Sequence[FlowTerm | AppearanceTerm] = (),
+        others: Sequence[BalanceTerm | FlowTerm | AppearanceTerm] = (),
         equations: NormalEquations | None = None,
     ) -> float:
         """Cost of ``state``; adds its derivatives to ``equations``."""
@@ -257,13 +257,12 @@ class Fit:
         cost += self._smooth(posed, layout, equations)
         cost += self._still(posed, layout, equations)
         cost += GroundTerm(self.times, w.ground, w.slide)(state, posed, figure, marks, layout, equations)
-        cost += self._balance(state, posed, figure, marks, layout, equations)
         cost += SharedTerm(lens, 1 + w.shared * len(state.translations), self.height)(
             state, figure, marks, layout, equations
         )
         if outline is not None:
             cost += outline(state, posed, layout, lens, equations)
-        return cost + sum(term(state, posed, layout, lens, equations) for term in images)
+        return cost + sum(term(state, posed, layout, lens, equations) for term in others)
 
     def run(self, stage: Stage, on_steps: Callable[[float], None]) -> None:
         """All steps of a stage, until its cost hardly falls; ``on_steps`` is called with how many are done."""
@@ -287,19 +286,18 @@ class Fit:
     def advance(self, stage: Stage) -> float:
         """One Gauss-Newton step with the terms of ``stage``; its cost."""
         points = self._point_term(stage)
-        self._balance = self._balanced()
         outline = self._outline_term() if stage.surface else None
         flows = self._flow_terms() if stage.surface else []
         reach = max([2, *(flow.gap for flow in flows)])
         equations = NormalEquations(len(self.observations), self.layout.unknowns, self.layout.shared, reach)
-        images: list[FlowTerm | AppearanceTerm] = [*flows, *self._appearance]
-        before = self.evaluate(self.state, points, outline, images, equations)
+        others: list[BalanceTerm | FlowTerm | AppearanceTerm] = [self._balance_term(), *flows, *self._appearance]
+        before = self.evaluate(self.state, points, outline, others, equations)
         for _ in range(4):
             local, shared = equations.solve(self.damping)
             turn = np.clip(local[:, :-3], -MAX_TURN, MAX_TURN)
             local = np.concatenate([turn, np.clip(local[:, -3:], -MAX_SHIFT, MAX_SHIFT)], 1)
             state = self.layout.moved(self.state, local, shared)
-            after = self.evaluate(state, points, outline, images)
+            after = self.evaluate(state, points, outline, others)
             if after <= before:
                 self.state, self.damping = state, max(self.damping * 0.3, 1e-5)
                 break

@@ -18,7 +18,7 @@ from .marks import Marks
 from .normal_equations import NormalEquations
 from .prior import Prior
 from .state import Layout, State
-from .terms import marks_by_shape, robust
+from .terms import Lens, marks_by_shape, robust
 
 Floats = NDArray[np.float64]
 
@@ -271,7 +271,7 @@ class GroundTerm:
             shared = np.zeros((*heights.shape, layout.shared))
             shared[..., layout.shape] = np.einsum("i,tpik->tpk", up, marks_by_shape(posed, figure, soles))
             shared[..., layout.ground.start] = -1
-            shared[..., layout.ground.start + 1 : layout.ground.stop] = up[1] * points @ _level(up).T
+            shared[..., layout.ground.start + 1 : layout.ground.stop] = up[1] * points @ _sideways(up).T
             scale = 1 / self.height_m
             weight = self.weight * (kept + below)
             equations.add(heights * scale, weight, height_by * scale, shared * scale)
@@ -294,6 +294,8 @@ class BalanceTerm:
         upright: [T] 1 for a person who stands, 0 for one who sits, lies or jumps.
     """
 
+    figure: Figure
+    marks: Marks
     shares: Floats
     inverse: Floats
     upright: Floats
@@ -301,7 +303,7 @@ class BalanceTerm:
     limit: float = 3.0
 
     @classmethod
-    def of(cls, state: State, posed: Posed, marks: Marks, weight: float) -> BalanceTerm:
+    def of(cls, figure: Figure, marks: Marks, state: State, posed: Posed, weight: float) -> BalanceTerm:
         """The term for the feet that ``state`` stands on."""
         soles, points = _soles(state, posed, marks)
         heights = points @ state.up - state.ground[0]
@@ -314,25 +316,19 @@ class BalanceTerm:
         pelvis = posed.joints[:, 0] @ state.up - state.ground[0] - low
         upright = np.clip((pelvis / standing - LOW_PELVIS) / (HIGH_PELVIS - LOW_PELVIS), 0, 1)
         upright *= np.exp(-0.5 * low**2 / REACH_M**2)
-        return cls(shares, 1 / np.sqrt(SWAY_M**2 + spread / 2), upright, weight)
+        return cls(figure, marks, shares, 1 / np.sqrt(SWAY_M**2 + spread / 2), upright, weight)
 
     def __call__(
-        self,
-        state: State,
-        posed: Posed,
-        figure: Figure,
-        marks: Marks,
-        layout: Layout,
-        equations: NormalEquations | None,
+        self, state: State, posed: Posed, layout: Layout, lens: Lens, equations: NormalEquations | None
     ) -> float:
-        soles, points = _soles(state, posed, marks)
+        soles, points = _soles(state, posed, self.marks)
         masses = np.array([MASSES.get(name.split("_")[-1], 0.0) for name in posed.skeleton.names])
         heavy = np.flatnonzero(masses)
         masses = masses[heavy] / masses.sum()
         lever = masses @ posed.joints[:, heavy] - np.einsum("tp,tpi->ti", self.shares, points)  # [T, 3]
         up = state.up
-        level = _level(up)
-        aside = lever @ level.T  # [T, 2]
+        sideways = _sideways(up)
+        aside = lever @ sideways.T  # [T, 2]
         residual = aside * self.inverse[:, None]
         squares = (residual**2).sum(1)
         kept = 1 / (1 + squares / self.limit**2)
@@ -341,18 +337,18 @@ class BalanceTerm:
             by_feet = point_derivative(posed, points, soles.joints, layout.active)
             local = np.einsum("p,tpid->tid", masses, by_mass) - np.einsum("tp,tpid->tid", self.shares, by_feet)
             shared = np.zeros((*residual.shape, layout.shared))
-            by_shape = np.einsum("p,tpik->tik", masses, shape_derivative(posed, figure.joint_basis)[:, heavy])
-            by_shape -= np.einsum("tp,tpik->tik", self.shares, marks_by_shape(posed, figure, soles))
-            shared[..., layout.shape] = level @ by_shape
-            over = (lever @ up)[:, None, None] * level[:, [0, 2]] + up[[0, 2]][:, None] * aside[:, None]
+            by_shape = np.einsum("p,tpik->tik", masses, shape_derivative(posed, self.figure.joint_basis)[:, heavy])
+            by_shape -= np.einsum("tp,tpik->tik", self.shares, marks_by_shape(posed, self.figure, soles))
+            shared[..., layout.shape] = sideways @ by_shape
+            over = (lever @ up)[:, None, None] * sideways[:, [0, 2]] + up[[0, 2]][:, None] * aside[:, None]
             shared[..., layout.ground.start + 1 : layout.ground.stop] = -up[1] * over
             inverse = self.inverse[:, None, None]
             weight = self.weight * np.repeat((self.upright * kept**2)[:, None], 2, axis=1)
-            equations.add(residual, weight, level @ local * inverse, shared * inverse)
+            equations.add(residual, weight, sideways @ local * inverse, shared * inverse)
         return self.weight * float((self.upright * squares * kept).sum())
 
 
-def _level(up: Floats) -> Floats:
+def _sideways(up: Floats) -> Floats:
     """X and Z without their part along ``up`` [2, 3]; times ``up[1]``, d up / d the ground's two slopes."""
     return np.eye(3)[[0, 2]] - np.outer(up[[0, 2]], up)
 
