@@ -88,6 +88,24 @@ def test_two_people_are_told_apart_by_an_option() -> None:
         start_of(images, person=2)
 
 
+def test_a_person_is_chosen_among_all_that_the_message_counts() -> None:
+    crowd = image((30, 20), (80, 60), (150, 56))  # a small bystander on the left
+    images = [image((80, 60)), crowd, *[crowd] * (COUNT - 2)]
+    with pytest.raises(InputError, match=r"frame \d+: people: expected one, got 3 .* 1 at x = 80, 2 at x = 150"):
+        start_of(images)
+    assert [round(start_of(images, person=k).region.x) for k in range(3)] == [30, 80, 150]
+
+
+def test_several_detections_of_one_person_are_one_person() -> None:
+    def twice(pixels: np.ndarray) -> list[Detection]:
+        return [found for one in blocks(pixels) for found in (one, Detection(one.region.scaled(0.6), 0.5))]
+
+    clip = Clip([image((60, 60))] * COUNT)
+    assert find_person(clip, list(clip.numbers), twice, Network()).frame == 0
+    with pytest.raises(InputError, match="--person: expected 0 to 0"):
+        find_person(clip, list(clip.numbers), twice, Network(), person=1)
+
+
 @pytest.mark.parametrize(
     "pixels, words",
     [

@@ -19,7 +19,8 @@ from .regions import Floats, Image, Region
 SIDE = 224  # pixels of the network's input
 MIN_SCORE = 0.5
 _STRIDES = ((8, 2), (16, 2), (32, 6))  # pixels between anchors, anchors at each
-_SAME = 0.3  # overlap from which two detections are one person
+_PARTS = (1.0, 0.6)  # of the image's shorter side
+_SAME = 0.3  # overlap from which candidates in one square are averaged
 _LOW = 0.3  # score of candidates that are averaged with a better one
 
 
@@ -39,19 +40,13 @@ class Detector:
         self._anchors = np.concatenate([_anchors(SIDE // stride, count) for stride, count in _STRIDES])
 
     def __call__(self, image: Image) -> list[Detection]:
-        """The people in ``image``, best first; parts of a large image are searched when the whole shows nobody."""
+        """The people in ``image``, surest first; parts are searched too, as the whole often shows only one of several."""
         height, width = image.shape[:2]
         found = self._in_square(image, np.array([width / 2, height / 2]), max(height, width))
-        if found:
-            return found
-        side = min(height, width)
-        for fraction in (1.0, 0.6):
-            part = side * fraction
+        for part in (fraction * min(height, width) for fraction in _PARTS):
             for y in _centres(height, part):
                 for x in _centres(width, part):
                     found += self._in_square(image, np.array([x, y]), part)
-            if found:
-                break
         return _distinct(sorted(found, key=lambda one: -one.score))
 
     def _in_square(self, image: Image, centre: Floats, side: float) -> list[Detection]:
@@ -95,7 +90,7 @@ def _averaged(points: Floats, scores: NDArray[Any]) -> list[Detection]:
 def _distinct(found: list[Detection]) -> list[Detection]:
     distinct: list[Detection] = []
     for one in found:
-        if one.region.size > 0 and all(one.region.overlap(other.region) <= _SAME for other in distinct):
+        if one.region.size > 0 and not any(one.region.same_person(other.region) for other in distinct):
             distinct.append(one)
     return distinct
 

@@ -14,6 +14,8 @@ Floats = NDArray[np.float64]
 
 BODY_SCALE = 1.25
 """side of a body's region in diameters of the circle through its two points, as BlazePose was trained"""
+_SAME_PERSON = 0.15
+"""distance of two regions' centres, in sides of the larger, from which they are of two people"""
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,11 @@ class Region:
         for a, b in ((self.x, other.x), (self.y, other.y)):
             shared *= max(0.0, min(a + half, b + its_half) - max(a - half, b - its_half))
         return shared / (self.size**2 + other.size**2 - shared)
+
+    def same_person(self, other: Region) -> bool:
+        """Whether the hips of both are about at one place; people side by side have regions that overlap."""
+        apart = float(np.hypot(self.x - other.x, self.y - other.y))
+        return apart < _SAME_PERSON * max(self.size, other.size)
 
 
 class Shrunk:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from statistics import mode
 from typing import Protocol
 
 import numpy as np
@@ -55,31 +56,28 @@ def find_person(
         InputError: nobody, nobody upright, several people of one size, or no such person.
     """
     sampled = [numbers[k] for k in spaced_indices(len(numbers), _SAMPLES)]
-    seen: dict[int, list[Detection]] = {}
+    seen: dict[int, list[Region]] = {}
     for done, number in enumerate(sampled):
-        image = video.frame(number)
-        people = [one for one in detector(image) if _confirmed(image, one.region, network)]
-        if people:
-            seen[number] = sorted(people, key=lambda one: -one.region.size)
+        if people := _people(video.frame(number), detector, network):
+            seen[number] = sorted(people, key=lambda one: -one.size)
         on_progress(done + 1, len(sampled))
     if not seen:
         raise _nobody(video, sampled, detector, network)
-    several = {number: _alike(people) for number, people in seen.items() if len(_alike(people)) > 1}
+    several = [number for number, people in seen.items() if len(_alike(people)) > 1]
+    usual = mode(len(seen[number]) for number in several or seen)
+    number = next(number for number, people in seen.items() if len(people) == usual)
+    row = sorted(seen[number], key=lambda one: one.x)
     if person is not None:
-        rows = {number: sorted(people, key=lambda one: one.region.x) for number, people in seen.items()}
-        number, row = next(((n, row) for n, row in rows.items() if len(row) > person), (None, []))
-        if number is None:
-            most = max(len(row) for row in rows.values())
-            raise InputError("--person", expected=f"0 to {most - 1}, counted from the left", got=person)
-        return Start(number, row[person].region)
+        if person >= len(row):
+            raise InputError("--person", expected=f"0 to {len(row) - 1}, counted from the left", got=person)
+        return Start(number, row[person])
     if len(several) > _OFTEN * len(seen):
-        number, people = next(iter(several.items()))
-        places = ", ".join(f"{k} at x = {x:.0f}" for k, x in enumerate(sorted(one.region.x for one in people)))
+        places = ", ".join(f"{k} at x = {one.x:.0f}" for k, one in enumerate(row))
         raise InputError(
-            "people", expected="one", got=f"{len(people)}", frame=number, hint=f"choose by --person: {places}"
+            "people", expected="one", got=f"{len(row)}", frame=number, hint=f"choose by --person: {places}"
         )
     number = next(iter(seen))
-    return Start(number, seen[number][0].region)
+    return Start(number, seen[number][0])
 
 
 def follow(
@@ -122,12 +120,18 @@ def _found_again(people: list[Detection], last: Region) -> Region | None:
     return max(near, key=lambda pair: pair[0])[1] if near else None
 
 
-def _confirmed(image: Image, region: Region, network: LandmarkNetwork) -> bool:
-    return _settled(image, region, network) is not None
+def _people(image: Image, detector: Detector, network: LandmarkNetwork) -> list[Region]:
+    """Regions of all whom ``network`` confirms; candidates that lead it to one person count once."""
+    people: list[Region] = []
+    for one in detector(image):
+        settled = _settled(image, one.region, network)
+        if settled is not None and not any(settled[0].same_person(other) for other in people):
+            people.append(settled[0])
+    return people
 
 
-def _alike(people: list[Detection]) -> list[Detection]:
-    return [one for one in people if one.region.size >= _ALIKE * people[0].region.size]
+def _alike(people: list[Region]) -> list[Region]:
+    return [one for one in people if one.size >= _ALIKE * people[0].size]
 
 
 def _nobody(video: Frames, sampled: list[int], detector: Detector, network: LandmarkNetwork) -> InputError:
@@ -139,7 +143,7 @@ def _nobody(video: Frames, sampled: list[int], detector: Detector, network: Land
     for quarters, name in ((1, "lying, head to the left"), (3, "lying, head to the right"), (2, "upside down")):
         for image in images:
             rotated = np.ascontiguousarray(np.rot90(image, -quarters))
-            if any(_confirmed(rotated, one.region, network) for one in detector(rotated)):
+            if _people(rotated, detector, network):
                 return InputError(
                     "person", expected="upright", got=f"lying, head to the {name}" if quarters != 2 else name
                 )
