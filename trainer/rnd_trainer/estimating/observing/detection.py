@@ -40,7 +40,7 @@ class Detector:
         self._anchors = np.concatenate([_anchors(SIDE // stride, count) for stride, count in _STRIDES])
 
     def __call__(self, image: Image) -> list[Detection]:
-        """The people in ``image``, surest first; parts are searched too, as the whole often shows only one of several."""
+        """The people in ``image``, surest first; parts are searched too, as the whole often shows one of several."""
         height, width = image.shape[:2]
         found = self._in_square(image, np.array([width / 2, height / 2]), max(height, width))
         for part in (fraction * min(height, width) for fraction in _PARTS):
