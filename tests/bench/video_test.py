@@ -7,9 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rnd_bench.studies.video import _errors, outline_iou
+from rnd_bench.studies.video import LIMBS, _errors, camera_landmarks, outline_iou
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.motion.motion import Motion
+from rnd_trainer.estimating.fitting.figure import default_figure
+from rnd_trainer.estimating.fitting.marks import marks_of
+from rnd_trainer.estimating.fitting.state import State
 from support.tiny import body
 
 
@@ -34,3 +37,20 @@ def test_outlines_overlap_where_the_body_is():
     box = empty.copy()
     box[pixels[:, 1].min() : pixels[:, 1].max(), pixels[:, 0].min() : pixels[:, 0].max()] = True
     assert 0.1 < outline_iou(found, [box], 1) < 0.9
+
+
+def test_landmarks_lie_near_the_joints_of_their_names_in_the_cameras_axes():
+    figure = default_figure()
+    names = figure.body.skeleton.names
+    state = State(
+        np.tile(np.eye(3), (1, len(names), 1, 1)),
+        np.array([[0.0, 0.0, -4.0]]),
+        np.zeros(len(figure.names)),
+        np.zeros_like(marks_of(figure).places),
+        6.0,
+        np.zeros(3),
+    )
+    landmarks = camera_landmarks(SimpleNamespace(state=state), LIMBS)[0]
+    joints = figure.body.skeleton.rest_joints[[names.index(name) for name in LIMBS]] + [0, 0, -4]
+    apart = np.linalg.norm(landmarks - joints * [1, -1, -1], axis=1)
+    assert apart.max() < 0.06 and landmarks[:, 2].min() > 3.7

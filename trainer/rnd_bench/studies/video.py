@@ -25,8 +25,11 @@ from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.playback.doctor import machine
 from rnd_trainer.checking.silhouette import mask_iou
 from rnd_trainer.estimating.fit import Estimate, estimate
-from rnd_trainer.estimating.fitting.figure import JOINTS
-from rnd_trainer.estimating.observations import Observations
+from rnd_trainer.estimating.fitting.figure import JOINTS, default_figure
+from rnd_trainer.estimating.fitting.marks import marks_of
+from rnd_trainer.estimating.fitting.state import TO_CAMERA
+from rnd_trainer.estimating.fitting.terms import mark_points
+from rnd_trainer.estimating.observations import BLAZEPOSE, Observations
 
 from .video_options import Video
 
@@ -103,14 +106,16 @@ def _real(folder: Path, out: Path) -> Iterator[dict[str, Any]]:
         start = time.process_time()
         found = estimate(seen[name])
         seconds = (time.process_time() - start) / len(seen[name])
-        skeleton = found.body.skeleton
-        joints = camera_joints(found)[rows[name]][:, [skeleton.names.index(n) for n in LIMBS]][whole]
+        order = [found.body.skeleton.names.index(n) for n in LIMBS]
+        joints = camera_joints(found)[rows[name]][:, order][whole]
+        landmarks = camera_landmarks(found, LIMBS)[rows[name]][whole]
         truth = points[whole] @ cameras[name].rotation.T + cameras[name].translation
         yield {
             "video": f"Pose2Sim {name}",
             "given": "nothing",
             "frames": int(whole.sum()),
-            **_errors(joints, truth, joints[:, :2].mean(1), truth[:, :2].mean(1)),
+            **_errors(landmarks, truth, landmarks[:, :2].mean(1), truth[:, :2].mean(1)),
+            "joints": _errors(joints, truth, joints[:, :2].mean(1), truth[:, :2].mean(1)),
             "focal_px": float(found.camera.K[0, 0]),
             "true_focal_px": float(cameras[name].intrinsics[0, 0]),
             "seconds_a_frame": seconds,
@@ -126,6 +131,16 @@ def camera_joints(found: Estimate) -> Floats:
     """Joints [T, J, 3] m of an estimate in its camera's axes."""
     moved = found.body.skeleton.joint_transforms(found.motion.rotations, found.motion.translations)
     return _in_camera(moved[:, :, :3, 3], found.camera)
+
+
+def camera_landmarks(found: Estimate, points: Sequence[str]) -> Floats:
+    """Positions [T, P, 3] m in the camera's axes at which the default figure of an estimate has BlazePose's ``points``.
+
+    A triangulation of landmarks is of these, not of joints: the network sees hips lower and shoulders higher.
+    """
+    figure = default_figure()
+    placed = mark_points(found.state, found.state.posed(figure), marks_of(figure))
+    return np.asarray(placed[:, [BLAZEPOSE.index(point) for point in points]] @ TO_CAMERA)
 
 
 def _scores(found: Floats, truth: Floats, ours: Skeleton, theirs: Skeleton, names: Sequence[str]) -> dict[str, float]:
