@@ -100,13 +100,13 @@ def flow_of(
 def _between(first: tuple[Image, Image], second: tuple[Image, Image]) -> tuple[NDArray[np.float64], Floats32]:
     """Box [4] and displacement [CELLS, CELLS, 2] from one (grey image, mask) to another."""
     height, width = first[0].shape
-    rows, columns = np.nonzero(np.maximum(first[1], second[1]) > 127)
-    if not len(rows):
+    x, y, wide, high = cv2.boundingRect((np.maximum(first[1], second[1]) > 127).astype(np.uint8))
+    if not wide:
         return np.array([0.0, 0, width, height]), np.full((CELLS, CELLS, 2), np.nan, np.float32)
-    side = max(np.ptp(rows), np.ptp(columns)) + 1
+    side = max(wide, high)
     margin = round(_MARGIN * side)
-    left, top = max(columns.min() - margin, 0), max(rows.min() - margin, 0)
-    right, bottom = min(columns.max() + 1 + margin, width), min(rows.max() + 1 + margin, height)
+    left, top = max(x - margin, 0), max(y - margin, 0)
+    right, bottom = min(x + wide + margin, width), min(y + high + margin, height)
     scale = min(ZOOM, SIDE / max(right - left, bottom - top))
     size = max(1, round((right - left) * scale)), max(1, round((bottom - top) * scale))
     parts = [

@@ -142,10 +142,15 @@ def _hands(
 def _alone(image: Image, mask: Image, size: float) -> Image:
     """``image`` with its mean colour in place of the background, so that nothing there looks like a limb."""
     reach = 2 * max(1, round(_AROUND * size)) + 1
-    grown = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+    plain = np.array(cv2.mean(image)[:3], np.float32)
+    alone = np.empty_like(image)
+    alone[:] = plain
+    left, top, width, height = cv2.boundingRect(mask)
+    rows, columns = (slice(max(a - reach, 0), a + n + reach) for a, n in ((top, height), (left, width)))
+    grown = cv2.dilate(mask[rows, columns], cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
     share = cv2.blur(grown, (reach, reach))[..., None] / np.float32(255)
-    plain = image.mean((0, 1), dtype=np.float32)
-    return np.asarray(image * share + plain * (1 - share), np.uint8)
+    alone[rows, columns] = image[rows, columns] * share + plain * (1 - share)
+    return alone
 
 
 def _outside(mask: Image, points: Floats) -> NDArray[np.float64]:

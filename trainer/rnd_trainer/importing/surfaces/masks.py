@@ -215,7 +215,8 @@ def colour_around(pixels: Floats32, where: Mask, reach: float) -> tuple[Floats32
 def share_of_person(pixels: Floats32, person: Floats32, behind: Floats32) -> Floats32:
     """Share [H, W] of the colour ``person`` in mixtures with ``behind`` [H, W, 3], unbounded; 1 where both are one."""
     across = person - behind
-    share = (((pixels - behind) * across).sum(-1) + 1e-6) / ((across**2).sum(-1) + 1e-6)
+    along, whole = (np.einsum("...c,...c->...", a, across) for a in (pixels - behind, across))
+    share = (along + 1e-6) / (whole + 1e-6)
     return np.asarray(share, np.float32)
 
 
