@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rnd_trainer.checking.silhouette import mask_iou
-from rnd_trainer.estimating.observing.masks import refine_masks
+from rnd_trainer.estimating.observing.masks import _median, refine_masks
 
 HEIGHT, WIDTH, COUNT = 200, 160, 14
 
@@ -90,3 +90,16 @@ def test_an_empty_mask_stays_empty() -> None:
     images, _, soft = clip()
     soft[3] = np.zeros_like(soft[3])
     assert list(refine_masks(images.__getitem__, soft))[3].max() == 0
+
+
+def test_a_background_is_the_median_of_the_frames_that_show_it() -> None:
+    rng = np.random.default_rng(3)
+    images = np.clip(rng.integers(40, 200, (1, 6, 30, 3)) + rng.normal(0, 3, (11, 6, 30, 3)), 0, 255).astype(np.uint8)
+    hidden = rng.random((11, 6, 30)) < 0.4
+    hidden[2:, 0, :5] = True
+    background = _median(images, hidden)
+    assert background is not None
+    np.testing.assert_array_equal(background.seen, (~hidden).sum(0) >= 3)
+    shown = np.where(hidden[..., None], np.nan, images)
+    expected = np.nanmedian(shown[:, background.seen], axis=0)
+    np.testing.assert_array_equal(background.colour[background.seen], expected)
