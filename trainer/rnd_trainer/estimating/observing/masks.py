@@ -170,7 +170,7 @@ def _deviation(background: Background) -> Floats32:
 def _difference_odds(pixels: Floats32, background: Background) -> Floats32:
     """Log odds of the person by the difference from the background; little where it is a shadow's."""
     blurred = cv2.GaussianBlur(pixels - background.colour, (0, 0), 0.6)
-    squared = np.einsum("...c,...c->...", blurred, blurred) / _deviation(background) ** 2
+    squared = np.vecdot(blurred, blurred) / _deviation(background) ** 2
     odds = np.clip(0.5 * squared - _DIFFERENCE, *_EVIDENCE)
     red, green, blue = cv2.split((pixels + 1) / (background.colour + 1))
     most, least = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
@@ -185,7 +185,7 @@ def _mixed(alpha: Floats32, pixels: Floats32, background: Background) -> Floats3
     sure = cv2.erode((alpha > 0.95).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     person, weight = colour_around(pixels, sure, _COLOUR_REACH)
     across = person - background.colour
-    contrast = np.einsum("...c,...c->...", across, across)
+    contrast = np.vecdot(across, across)
     share = share_of_person(pixels, person, background.colour)
     trust = contrast / (contrast + (_MIN_CONTRAST * _deviation(background)) ** 2)
     edge = cv2.dilate((np.abs(alpha - 0.5) < 0.45).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

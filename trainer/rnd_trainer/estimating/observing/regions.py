@@ -14,8 +14,7 @@ Floats = NDArray[np.float64]
 
 BODY_SCALE = 1.25
 """side of a body's region in diameters of the circle through its two points, as BlazePose was trained"""
-_SAME_PERSON = 0.15
-"""distance of two regions' centres, in sides of the larger, from which they are of two people"""
+_SAME_PERSON = 0.15  # distance of two regions' centres, in sides of the larger, from which they are of two people
 
 
 @dataclass(frozen=True)

@@ -215,8 +215,7 @@ def colour_around(pixels: Floats32, where: Mask, reach: float) -> tuple[Floats32
 def share_of_person(pixels: Floats32, person: Floats32, behind: Floats32) -> Floats32:
     """Share [H, W] of the colour ``person`` in mixtures with ``behind`` [H, W, 3], unbounded; 1 where both are one."""
     across = person - behind
-    along, whole = (np.einsum("...c,...c->...", a, across) for a in (pixels - behind, across))
-    share = (along + 1e-6) / (whole + 1e-6)
+    share = (np.vecdot(pixels - behind, across) + 1e-6) / (np.vecdot(across, across) + 1e-6)
     return np.asarray(share, np.float32)
 
 
