@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 Floats = NDArray[np.float64]
 
@@ -54,10 +54,9 @@ class NormalEquations:
     def solve(self, damping: float) -> tuple[Floats, Floats]:
         """The step [T, D], [G] that minimises the quadratic model, diagonals raised by ``damping`` of themselves."""
         frames, unknowns = self.gradient.shape
-        factor = self._factor(damping)
-        right = np.concatenate([self.gradient.reshape(-1, 1), self.border.reshape(frames * unknowns, -1)], axis=1)
-        solved = cho_solve_banded((factor, True), right, check_finite=False)
-        border = right[:, 1:]
+        right = np.concatenate([self.gradient[..., None], self.border], axis=2)
+        solved = self._solved(right, damping).reshape(frames * unknowns, -1)
+        border = right[..., 1:].reshape(frames * unknowns, -1)
         corner = self.corner * (1 + damping * np.eye(len(self.corner))) - border.T @ solved[:, 1:]
         corner += 1e-9 * np.eye(len(corner))
         shared = -cho_solve(cho_factor(corner), self.shared_gradient - border.T @ solved[:, 0])
@@ -72,17 +71,26 @@ class NormalEquations:
         blocks = self.blocks[0] + 1e-6 * np.eye(self.blocks[0].shape[-1])
         return np.diagonal(np.linalg.inv(blocks), axis1=1, axis2=2).copy()
 
-    def _factor(self, damping: float) -> Floats:
-        frames, unknowns = self.gradient.shape
-        band = np.zeros((unknowns * len(self.blocks), frames * unknowns))  # lower form: band[i − j, j] = A[i, j]
-        rows, columns = np.indices((unknowns, unknowns))
-        for k, blocks in enumerate(self.blocks):
-            if not len(blocks):
-                continue
-            turned = np.swapaxes(blocks, 1, 2) if k else blocks  # A[t + k, t]
-            below = rows - columns + k * unknowns
-            keep = below >= 0
-            start = np.arange(len(blocks))[:, None] * unknowns
-            band[below[keep][None], start + columns[keep][None]] = turned[:, keep]
-        band[0] = band[0] * (1 + damping) + 1e-6
-        return np.asarray(cholesky_banded(band, lower=True, check_finite=False))
+    def _solved(self, right: Floats, damping: float) -> Floats:
+        """The banded matrix' inverse times ``right`` [T, D, R], by a Cholesky factor of its blocks."""
+        rows: list[list[Floats]] = []  # rows[t][k]: the factor's block of the frames t and t − k
+        solved = np.empty_like(right)
+        for t in range(len(right)):
+            row = [blocks[t - k].T for k, blocks in enumerate(self.blocks[: t + 1])]
+            row[0] = row[0] + np.diag(damping * np.diagonal(row[0]) + 1e-6)
+            rows.append(row)
+            for k in reversed(range(len(row))):
+                for j in range(k + 1, len(row)):
+                    row[k] = row[k] - row[j] @ rows[t - k][j - k].T
+                row[k] = _divided(row[k].T, rows[t - k][0]).T if k else np.linalg.cholesky(row[0])
+            solved[t] = _divided(right[t] - sum(row[k] @ solved[t - k] for k in range(1, len(row))), row[0])
+        for t in reversed(range(len(right))):
+            later = range(1, min(len(self.blocks), len(right) - t))
+            left = solved[t] - sum(rows[t + k][k].T @ solved[t + k] for k in later)
+            solved[t] = _divided(left, rows[t][0], transposed=True)
+        return solved
+
+
+def _divided(right: Floats, factor: Floats, transposed: bool = False) -> Floats:
+    """``right`` by a lower triangular ``factor``."""
+    return np.asarray(solve_triangular(factor, right, trans=int(transposed), lower=True, check_finite=False))

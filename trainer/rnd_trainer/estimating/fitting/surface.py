@@ -59,18 +59,20 @@ class Surface:
         self.bones = np.argsort(-body.skinning_weights, axis=1)[:, :BONES].astype(np.int64)
         weights = np.take_along_axis(body.skinning_weights.astype(np.float64), self.bones, 1)
         self.weights = weights / weights.sum(1, keepdims=True)
+        self.blend = np.zeros(body.skinning_weights.shape)
+        np.put_along_axis(self.blend, self.bones, self.weights, 1)
         self.inner = _spread(body.vertices, INNER)
+        self._shape, self._vertices = np.zeros(len(figure.names)), body.vertices
 
     def whole(self, state: State, posed: Posed, frame: int) -> Floats:
         """Positions [V, 3] of all vertices in one frame, in the fit's world."""
-        return self._positions(state, posed, frame, np.arange(len(self.weights)))
+        return _moved(self._blended(posed, frame), self._rest(state.shape))
 
     def of_frame(self, state: State, posed: Posed, frame: int) -> tuple[Floats, Floats]:
         """Positions and normals [D, 3] of the dense vertices in one frame, in the fit's world."""
-        points = self._positions(state, posed, frame, self.dense)
-        weights, bones = self.weights[self.dense], self.bones[self.dense]
-        turn = np.einsum("pb,pbij->pij", weights, posed.world[frame][bones])
-        return points, np.einsum("pij,pj->pi", turn, self.normals[self.dense])
+        blended = self._blended(posed, frame, self.dense)
+        points = _moved(blended, self._rest(state.shape)[self.dense])
+        return points, np.einsum("pij,pj->pi", blended[..., :3], self.normals[self.dense])
 
     def visible(self, state: State, posed: Posed, lens: Lens, frame: int) -> tuple[Ints, Floats]:
         """Vertices that the camera sees in one frame, and their pixels [P, 2]."""
@@ -112,22 +114,32 @@ class Surface:
         shared[..., layout.focal] = seen.pixels - lens.centre
         return shared
 
-    def _positions(self, state: State, posed: Posed, frame: int, vertices: Ints) -> Floats:
-        """Positions [P, 3] of ``vertices`` [P] in one frame."""
-        parts = self._parts(posed.part(slice(frame, frame + 1)), state.shape, vertices[None])[0]
-        return np.asarray(np.einsum("pb,pbi->pi", self.weights[vertices], parts))
+    def _rest(self, shape: Floats) -> Floats:
+        """All vertices [V, 3] at rest; the last shape's are kept for the other frames and terms of a step."""
+        if not np.array_equal(shape, self._shape):
+            self._shape, self._vertices = shape.copy(), self.figure.shaped(shape).vertices
+        return self._vertices
+
+    def _blended(self, posed: Posed, frame: int, vertices: Ints | slice = slice(None)) -> Floats:
+        """Transforms [P, 3, 4] of ``vertices`` [P] in one frame, by linear blend skinning."""
+        turn = posed.world[frame]
+        shift = posed.joints[frame] - (turn @ posed.rest[..., None])[..., 0]
+        transforms = np.concatenate([turn, shift[..., None]], -1).reshape(len(turn), 12)
+        return (self.blend[vertices] @ transforms).reshape(-1, 3, 4)
 
     def _parts(self, posed: Posed, shape: Floats, vertices: Ints) -> Floats:
         """Positions [T, P, BONES, 3] of ``vertices`` [T, P] as each of their bones moves them."""
-        rest = self.figure.body.vertices[vertices] + np.tensordot(
-            np.moveaxis(self.figure.vertex_basis[:, vertices], 0, -1), shape, 1
-        )
         bones = self.bones[vertices]
         frames = np.arange(len(posed))[:, None, None]
-        lever = rest[:, :, None] - posed.rest[bones]
+        lever = self._rest(shape)[vertices][:, :, None] - posed.rest[bones]
         return np.asarray(
             posed.joints[frames, bones] + np.einsum("tpbij,tpbj->tpbi", posed.world[frames, bones], lever)
         )
+
+
+def _moved(transforms: Floats, points: Floats) -> Floats:
+    """``points`` [P, 3] by one of ``transforms`` [P, 3, 4] each."""
+    return np.asarray(np.einsum("pij,pj->pi", transforms[..., :3], points) + transforms[..., 3])
 
 
 def spaced(pixels: Floats, usable: Ints, metre: float, rng: np.random.Generator) -> Ints:
