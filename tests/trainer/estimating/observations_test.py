@@ -18,6 +18,7 @@ def observed(count: int = 4, size: tuple[int, int] = (24, 32)) -> Observations:
     confidence = np.array([[0, 1]] * count, np.float32)
     hands[:, 0] = np.nan
     masks = rng.integers(0, 256, (count, height, width), dtype=np.uint8)
+    masks[1], masks[2, :9], masks[2, :, 20:] = 0, 0, 0
     displacement = rng.normal(size=(count - 1, CELLS, CELLS, 2)).astype(np.float16)
     displacement[:, :9] = np.nan
     return Observations(
@@ -54,6 +55,7 @@ def test_selected_frames_take_their_masks_along() -> None:
     assert few.flow == ()
     assert few.frames.tolist() == [2, 6]
     np.testing.assert_array_equal(few.masks[1], seen.masks[3])
+    assert seen.masks[2][9:, :20].any() and not seen.masks[1].any()
     np.testing.assert_array_equal(seen.masks[1:3][1], seen.masks[2])
 
 
@@ -71,3 +73,7 @@ def test_wrong_shapes_and_damaged_masks_are_refused(tmp_path: Path) -> None:
     save_npz(tmp_path / "scrambled.npz", scrambled)
     with pytest.raises(InputError, match="grey image"):
         load_observations(tmp_path / "scrambled.npz").masks[0]
+    for corner in (-1, 3):
+        save_npz(tmp_path / "aside.npz", {**arrays, "masks_corners": np.full((len(seen), 2), corner)})
+        with pytest.raises(InputError, match="grey image"):
+            load_observations(tmp_path / "aside.npz").masks[0]

@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from rnd_runtime.capture.body import Body
 from rnd_runtime.core.camera import Camera
@@ -116,10 +117,11 @@ def estimate(
         raise InputError("lifted bones", expected=f"{count} frames", got=len(lifted))
     fit = Fit(observations, lifted, figure, lens, height, weights)
     total, done = sum(stage.length for stage in STAGES), 0
-    for stage in STAGES:
-        fit.run(stage, partial(_report, on_progress, done, total))
-        done += stage.length
-        on_progress(done, total)
+    with threadpool_limits(1, "blas"):  # for matrices of 70 columns threads only wait
+        for stage in STAGES:
+            fit.run(stage, partial(_report, on_progress, done, total))
+            done += stage.length
+            on_progress(done, total)
     return fit.result()
 
 

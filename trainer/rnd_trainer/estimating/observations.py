@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, NamedTuple, overload
 
 import cv2
 import numpy as np
@@ -40,13 +40,21 @@ _SURE = 200  # of 255, a mask's value well inside of the person
 _LEVEL = 3  # zlib's, of a PNG: higher ones cost time and save little
 
 
+class Encoded(NamedTuple):
+    """What is not 0 of a grey image, as a PNG; its upper left pixel."""
+
+    png: bytes
+    left: int
+    top: int
+
+
 class GreyImages:
     """Images [T, H, W] uint8, such as masks (255 is the person); stored compressed, decoded when indexed.
 
     ``images[k]`` is [H, W], a slice or an index array gives [n, H, W]; ``numpy.asarray(images)`` decodes all of them.
     """
 
-    def __init__(self, encoded: Iterable[bytes], image_size: tuple[int, int]) -> None:
+    def __init__(self, encoded: Iterable[Encoded], image_size: tuple[int, int]) -> None:
         self.encoded = list(encoded)
         self.image_size = image_size
 
@@ -91,13 +99,15 @@ class GreyImages:
         return GreyImages((self.encoded[int(k)] for k in np.arange(len(self))[frames]), self.image_size)
 
     def _decode(self, frame: int) -> Image:
-        pixels = cv2.imdecode(np.frombuffer(self.encoded[frame], np.uint8), cv2.IMREAD_GRAYSCALE)
-        if pixels is None or pixels.shape != self.shape[1:]:
-            got = "damaged data" if pixels is None else f"{pixels.shape[1]} x {pixels.shape[0]}"
-            raise InputError(
-                "grey image", expected=f"{self.image_size[0]} x {self.image_size[1]}", got=got, frame=frame
-            )
-        return np.asarray(pixels, np.uint8)
+        png, left, top = self.encoded[frame]
+        pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
+        width, height = self.image_size
+        image = np.zeros((height, width), np.uint8)
+        if pixels is None or min(left, top) < 0 or left + pixels.shape[1] > width or top + len(pixels) > height:
+            got = "damaged data" if pixels is None else f"{pixels.shape[1]} x {pixels.shape[0]} at {left}, {top}"
+            raise InputError("grey image", expected=f"within {width} x {height}", got=got, frame=frame)
+        image[top : top + len(pixels), left : left + pixels.shape[1]] = pixels
+        return image
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,8 +185,9 @@ def save_observations(path: str | Path, observations: Observations) -> None:
     arrays["image_size"] = np.array(observations.image_size)
     for name in ("masks", "person"):
         if images := getattr(observations, name):
-            arrays[f"{name}_png"] = np.frombuffer(b"".join(images.encoded), np.uint8)
-            arrays[f"{name}_ends"] = np.cumsum([len(png) for png in images.encoded], dtype=np.int64)
+            arrays[f"{name}_png"] = np.frombuffer(b"".join(one.png for one in images.encoded), np.uint8)
+            arrays[f"{name}_ends"] = np.cumsum([len(one.png) for one in images.encoded], dtype=np.int64)
+            arrays[f"{name}_corners"] = np.array([(one.left, one.top) for one in images.encoded])
     for flow in observations.flow:
         arrays[f"flow{flow.gap}_boxes"] = flow.boxes
         arrays[f"flow{flow.gap}_known"] = np.asarray(np.isfinite(flow.displacement).all(-1))
@@ -219,8 +230,8 @@ def _images(archive: Npz, name: str, count: int, size: tuple[int, int]) -> GreyI
     starts = np.concatenate([[0], ends[:-1]])
     if (ends <= starts).any() or (count and ends[-1] != len(pixels)):
         raise InputError(f"{name}_ends", expected=f"ascending positions in {name}_png", got="others", file=archive.path)
-    encoded = pixels.tobytes()
-    return GreyImages((encoded[a:b] for a, b in zip(starts, ends)), size)
+    encoded, corners = pixels.tobytes(), archive.numbers(f"{name}_corners", (count, 2)).astype(np.int64).tolist()
+    return GreyImages((Encoded(encoded[a:b], *corner) for a, b, corner in zip(starts, ends, corners)), size)
 
 
 def _flow(archive: Npz, gap: int, count: int) -> Flow:
@@ -230,7 +241,9 @@ def _flow(archive: Npz, gap: int, count: int) -> Flow:
     return Flow(gap, archive.numbers(f"flow{gap}_boxes", (pairs, 4)), displacement)
 
 
-def _encode(image: Image) -> bytes:
-    done, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, _LEVEL])
+def _encode(image: Image) -> Encoded:
+    left, top, width, height = cv2.boundingRect(image)
+    part = image[top : top + max(height, 1), left : left + max(width, 1)]
+    done, png = cv2.imencode(".png", part, [cv2.IMWRITE_PNG_COMPRESSION, _LEVEL])
     assert done
-    return bytes(png)
+    return Encoded(bytes(png), left, top)
