@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import output_folder
 from rnd_runtime.core.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
 
+from .ahead import ahead
 from .dataset import ImportedDataset, Sample
 from .images import Bytes, check_size
 from .options import OnProgress, no_progress
@@ -41,10 +43,11 @@ def write_capture(
     """
     output_folder(folder)
     first = int(dataset.poses.frames[0])
+    read = ((sample, _maps(sample, scene.cameras[sample.camera])) for sample in samples)
     frames = []
-    for done, sample in enumerate(samples):
-        frames.append(_write_sample(folder, sample, scene.cameras[sample.camera], sample.frame - first))
-        on_progress("writing images", done + 1, len(samples))
+    for frame in ahead(lambda one: _write_sample(folder, *one, first), read):
+        frames.append(frame)
+        on_progress("writing images", len(frames), len(samples))
     used = {name: scene.cameras[name] for name in dict.fromkeys(frame.camera for frame in frames)}
     undone = {name: list(lens.undone) for name in used if any((lens := dataset.lenses[name]).undone)}
     notes = {"kind": dataset.kind, "notes": scene.notes, "distortion": undone, "turn": scene.rotation.tolist()}
@@ -54,17 +57,21 @@ def write_capture(
     save_capture(capture, **{"import": notes})
 
 
-def _write_sample(folder: Path, sample: Sample, camera: Camera, frame: int) -> Frame:
-    name = f"{sample.camera}_{sample.frame:06d}.png".replace(" ", "_").replace("/", "_")
+def _maps(sample: Sample, camera: Camera) -> dict[str, NDArray[Any]]:
+    """The sample's image, mask and what else it has, of the camera's size."""
+    if sample.mask is None:
+        raise InputError("mask", expected="one for every image", got="none", frame=sample.frame)
+    read = {"image": sample.image, "mask": sample.mask, "normals": sample.normals, "albedo": sample.albedo}
     try:
-        if sample.mask is None:
-            raise InputError("mask", expected="one for every image", got="none")
-        image, mask = check_size(sample.image(), camera, "image"), check_size(sample.mask(), camera, "mask")
-        normals = None if sample.normals is None else check_size(sample.normals(), camera, "normals")
-        albedo = None if sample.albedo is None else check_size(sample.albedo(), camera, "albedo")
+        return {what: check_size(pixels(), camera, what) for what, pixels in read.items() if pixels is not None}
     except InputError as error:
         raise error.at(frame=sample.frame) from error
-    write_image(folder / "images" / name, premultiplied(image, mask))
+
+
+def _write_sample(folder: Path, sample: Sample, maps: dict[str, NDArray[Any]], first: int) -> Frame:
+    name = f"{sample.camera}_{sample.frame:06d}.png".replace(" ", "_").replace("/", "_")
+    mask, normals, albedo = maps["mask"], maps.get("normals"), maps.get("albedo")
+    write_image(folder / "images" / name, premultiplied(maps["image"], mask))
     write_image(folder / "masks" / name, mask)
     if albedo is not None:
         write_image(folder / "albedo_estimates" / name, premultiplied(albedo, mask))
@@ -76,8 +83,8 @@ def _write_sample(folder: Path, sample: Sample, camera: Camera, frame: int) -> F
     assert sample.split is not None
     normal = None if normals is None else f"normals/{name}"
     estimate = None if albedo is None else f"albedo_estimates/{name}"
-    files = f"images/{name}", f"masks/{name}"
-    return Frame(*files, sample.camera, frame, sample.split, normal=normal, albedo_estimate=estimate)
+    files, number = (f"images/{name}", f"masks/{name}"), sample.frame - first
+    return Frame(*files, sample.camera, number, sample.split, normal=normal, albedo_estimate=estimate)
 
 
 def premultiplied(image_srgb: Bytes, mask: Bytes) -> Bytes:

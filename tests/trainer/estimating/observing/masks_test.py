@@ -47,9 +47,13 @@ def ious(masks: list[np.ndarray], truths: list[np.ndarray]) -> np.ndarray:
     return np.array([mask_iou(mask > 127, truth > 127) for mask, truth in zip(masks, truths)])
 
 
+def refined(images: list[np.ndarray], soft: list[np.ndarray]) -> list[np.ndarray]:
+    return [mask for _, mask in refine_masks(images.__getitem__, soft)]
+
+
 def test_the_background_of_a_static_camera_sharpens_masks() -> None:
     images, truths, soft = clip()
-    before, after = ious(soft, truths), ious(list(refine_masks(images.__getitem__, soft)), truths)
+    before, after = ious(soft, truths), ious(refined(images, soft), truths)
     assert before.mean() < 0.91
     assert after.min() > 0.92 and after.mean() > 0.965
 
@@ -61,7 +65,7 @@ def test_a_codecs_errors_beside_the_person_are_not_the_person() -> None:
         beside = cv2.dilate(truth, np.ones((13, 13), np.uint8))[..., None] > 0
         error = cv2.GaussianBlur(rng.normal(size=image.shape), (0, 0), 1.5)
         image[:] = np.clip(image + beside * 6 * error / error.std(), 0, 255)
-    masks = list(refine_masks(images.__getitem__, soft))
+    masks = refined(images, soft)
     over = [((mask > 127) & (truth < 1)).sum() / (truth > 127).sum() for mask, truth in zip(masks, truths)]
     assert np.mean(over) < 0.025
 
@@ -72,7 +76,7 @@ def test_a_moving_background_leaves_the_networks_masks_about_as_they_are() -> No
     for k, (image, truth) in enumerate(zip(images, truths)):
         elsewhere = textured(50 + k, (120, 130, 90)).astype(np.uint8)
         moved.append(np.where(truth[..., None] > 0, image, elsewhere))
-    after = ious(list(refine_masks(moved.__getitem__, soft)), soft)
+    after = ious(refined(moved, soft), soft)
     assert after.min() > 0.9
 
 
@@ -81,7 +85,7 @@ def test_large_images_are_worked_on_smaller(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(masks, "MAX_SIDE", 90)
     images, truths, soft = clip()
-    after = list(refine_masks(images.__getitem__, soft))
+    after = refined(images, soft)
     assert after[0].shape == (HEIGHT, WIDTH)
     assert ious(after, truths).mean() > 0.92
 
@@ -89,7 +93,7 @@ def test_large_images_are_worked_on_smaller(monkeypatch: pytest.MonkeyPatch) -> 
 def test_an_empty_mask_stays_empty() -> None:
     images, _, soft = clip()
     soft[3] = np.zeros_like(soft[3])
-    assert list(refine_masks(images.__getitem__, soft))[3].max() == 0
+    assert refined(images, soft)[3].max() == 0
 
 
 def test_a_background_is_the_median_of_the_frames_that_show_it() -> None:

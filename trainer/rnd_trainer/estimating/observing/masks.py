@@ -5,8 +5,10 @@ Source: He et al. 2013, Guided image filtering; Qian and Sezan 1992, Video backg
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import cv2
@@ -14,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.arrays import spaced_indices
+from rnd_trainer.importing.ahead import ahead
 from rnd_trainer.importing.surfaces.masks import (
     Floats32,
     bounding_box,
@@ -28,8 +31,7 @@ from .regions import Image
 
 MAX_SIDE = 800
 """pixels of the person's height at which masks are made; larger ones are enlarged from it"""
-_ROUNDS = 2  # of the background: the second one knows the person's outline
-_CLEARANCES = (0.04, 0.006)  # of the person's height around the mask, hidden in each round
+_CLEARANCES = (0.04, 0.006)  # of the person's height around the mask, hidden in each round of the background
 _FRAMES, _MAX_BYTES = 40, 600 << 20
 _MIN_SEEN = 3  # frames that show a pixel of the background
 _MIN_NOISE, _MAX_NOISE = 3.5, 12.0  # 8-bit steps of a static camera; beside a person codecs err by more
@@ -64,19 +66,24 @@ class Soft(Protocol):
 
 def refine_masks(
     frame: Callable[[int], Image], soft: Soft, on_progress: Callable[[int, int], None] = lambda done, total: None
-) -> Iterator[Image]:
-    """Yield a mask [H, W] uint8 for each of ``soft``, the network's masks of the images that ``frame`` gives by index.
+) -> Iterator[tuple[Image, Image]]:
+    """Yield each of the images that ``frame`` gives by index, and its mask [H, W] uint8; ``soft`` are a network's.
 
     Frames whose mask is empty stay empty.
     """
     heights = [mask_height(mask > 127) for mask in soft if (mask > 127).any()]
     scale = min(1.0, MAX_SIDE / max(heights, default=1))
     background = _learn_background(frame, soft, scale)
-    for k, mask in enumerate(soft):
-        image = frame(k)
+
+    def refined(pair: tuple[Image, Image]) -> tuple[Image, Image]:
+        image, mask = pair
         small = _matte(_resized(image, scale), _resized(mask, scale), background)
-        yield small if scale == 1 else _resized(small, (mask.shape[1], mask.shape[0]))
-        on_progress(k + 1, len(soft))
+        return image, small if scale == 1 else _resized(small, (mask.shape[1], mask.shape[0]))
+
+    pairs = ((frame(k), mask) for k, mask in enumerate(soft))
+    for done, pair in enumerate(ahead(refined, pairs)):
+        yield pair
+        on_progress(done + 1, len(soft))
 
 
 def _learn_background(frame: Callable[[int], Image], soft: Soft, scale: float) -> Background | None:
@@ -86,14 +93,15 @@ def _learn_background(frame: Callable[[int], Image], soft: Soft, scale: float) -
     first = _resized(frame(0), scale)
     count = int(np.clip(_MAX_BYTES // (first.size + 1), _MIN_SEEN, min(_FRAMES, len(soft))))
     chosen = spaced_indices(len(soft), count)
-    images = np.stack([_resized(frame(int(k)), scale) for k in chosen])
+    images = np.stack(list(ahead(lambda image: _resized(image, scale), (frame(int(k)) for k in chosen))))
     network = [_resized(soft[int(k)], scale) for k in chosen]
     masks, background = [mask > 76 for mask in network], None
-    for clearance in _CLEARANCES[:_ROUNDS]:
-        background = _median(images, np.stack([dilated(mask, clearance) for mask in masks]))
+    for clearance in _CLEARANCES:
+        if background is not None:
+            masks = [mask > 127 for mask in ahead(partial(_matted, background), zip(images, network))]
+        background = _median(images, np.stack(list(ahead(partial(dilated, share=clearance), masks))))
         if background is None:
             return None
-        masks = [_matte(image, mask, background) > 127 for image, mask in zip(images, network)]
     return background
 
 
@@ -103,13 +111,16 @@ def _median(images: NDArray[np.uint8], hidden: NDArray[np.bool_]) -> Background 
     seen = shows >= _MIN_SEEN
     colour = np.zeros(images.shape[1:], np.float32)
     noise = np.zeros(images.shape[1:3], np.float32)
-    for row, columns in enumerate(seen):
-        if columns.any():
-            count = shows[row, columns, None]
-            shown = np.where(hidden[:, row, columns, None], np.float32(np.inf), images[:, row, columns])
-            shown = np.ascontiguousarray(np.moveaxis(shown, 0, -1))
-            colour[row, columns] = middle = _middle(shown, count)
-            noise[row, columns] = 1.48 * _middle(np.abs(shown - middle[..., None]), count).max(-1)
+
+    def learn(row: int) -> None:
+        columns = seen[row]
+        count = shows[row, columns, None]
+        shown = np.where(hidden[:, row, columns, None], np.float32(np.inf), images[:, row, columns])
+        shown = np.ascontiguousarray(np.moveaxis(shown, 0, -1))
+        colour[row, columns] = middle = _middle(shown, count)
+        noise[row, columns] = 1.48 * _middle(np.abs(shown - middle[..., None]), count).max(-1)
+
+    deque(ahead(learn, np.flatnonzero(seen.any(1)).tolist()), maxlen=0)
     if not seen.any():
         return None
     usual = float(np.median(noise[seen]))
@@ -125,6 +136,10 @@ def _middle(values: Floats32, count: NDArray[np.int64]) -> Floats32:
     ranked = np.sort(values, axis=-1)
     low, high = (np.take_along_axis(ranked, k[..., None], -1)[..., 0] for k in ((count - 1) // 2, count // 2))
     return np.asarray((low + high) / 2, np.float32)
+
+
+def _matted(background: Background, pair: tuple[Image, Image]) -> Image:
+    return _matte(*pair, background)
 
 
 def _matte(image: Image, soft: Image, background: Background | None) -> Image:

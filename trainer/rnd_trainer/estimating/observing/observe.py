@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rnd_runtime.core.errors import InputError
 from rnd_trainer.estimating.flow import flow_of
 from rnd_trainer.estimating.observations import GreyImages, Observations, only_person
+from rnd_trainer.importing.ahead import ahead
 
 from .detection import Detector
 from .hands import HandNetwork, Hands
@@ -91,12 +92,11 @@ def observe(
         raise InputError("frames with the person in view", expected=f"at least {MIN_FRAMES}", got=len(frames))
     masks, person_alone = GreyImages([], soft.image_size), GreyImages([], soft.image_size)
     refined = refine_masks(lambda k: video.frame(frames[k]), soft, lambda k, n: on_progress("masks", k, n))
+    people = ((image, mask, views.region.size) for (image, mask), views in zip(refined, first))
     second, outside = [], []
-    for k, mask in enumerate(refined):
-        image = video.frame(frames[k])
+    for k, (mask, grey, alone) in enumerate(ahead(_person_of, people)):
         masks.append(mask)
-        person_alone.append(only_person(image, mask))
-        alone = _alone(image, mask, first[k].region.size)
+        person_alone.append(grey)
         views = networks.landmarks.look_twice(alone, first[k].region.scaled(_WIDER))
         second.append(views.without_mask())
         outside.append(_outside(mask, np.concatenate([first[k].points, views.points])))
@@ -137,6 +137,12 @@ def _hands(
         hands.append(network(video.frame(number), merged.points[k], merged.confidence[k]))
         on_progress("hands", k + 1, len(frames))
     return hands
+
+
+def _person_of(one: tuple[Image, Image, float]) -> tuple[Image, Image, Image]:
+    """The mask, and the person alone in grey levels and in colour, of an image, its mask and the person's size."""
+    image, mask, size = one
+    return mask, only_person(image, mask), _alone(image, mask, size)
 
 
 def _alone(image: Image, mask: Image, size: float) -> Image:
