@@ -24,7 +24,7 @@ from .motions import FPS
 def observed(file: Path, kept: Path, every: int = 1) -> Observations:
     """What the networks see of every n-th frame of a steadied video; stored as .npz, and read from there again."""
     if not kept.exists():
-        video, networks = VideoFile(file), Networks.open(1)
+        video, networks = VideoFile(file), Networks.open()
         numbers = list(video.numbers)[::every]
         people = [one.region for one in networks.detector(video.frame(numbers[0]))]
         save_observations(kept, observe(steady(video, numbers, people), networks, numbers=numbers))

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from statistics import mode
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from rnd_runtime.core.arrays import spaced_indices
 from rnd_runtime.core.errors import InputError
+from rnd_trainer.importing.ahead import ahead
 
 from .detection import Detection, Detector
 from .landmarks import SIDE, LandmarkNetwork, View, Views
@@ -43,12 +44,7 @@ class Start:
 
 
 def find_person(
-    video: Frames,
-    numbers: list[int],
-    detector: Detector,
-    network: LandmarkNetwork,
-    person: int | None = None,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    video: Frames, numbers: list[int], detector: Detector, network: LandmarkNetwork, person: int | None = None
 ) -> Start:
     """The person to follow: the only one, the largest one by far, or number ``person`` from the left.
 
@@ -57,10 +53,10 @@ def find_person(
     """
     sampled = [numbers[k] for k in spaced_indices(len(numbers), _SAMPLES)]
     seen: dict[int, list[Region]] = {}
-    for done, number in enumerate(sampled):
-        if people := _people(video.frame(number), detector, network):
+    images = (video.frame(number) for number in sampled)
+    for number, people in zip(sampled, ahead(lambda image: _people(image, detector, network), images)):
+        if people:
             seen[number] = sorted(people, key=lambda one: -one.size)
-        on_progress(done + 1, len(sampled))
     if not seen:
         raise _nobody(video, sampled, detector, network)
     several = [number for number, people in seen.items() if len(_alike(people)) > 1]
@@ -84,6 +80,22 @@ def follow(
     video: Frames, numbers: list[int], start: Start, detector: Detector, network: LandmarkNetwork
 ) -> Iterator[tuple[int, Views | None]]:
     """Yield each frame's number and the views of the person in it, None where the person is not seen."""
+
+    def views_of(one: _Followed) -> tuple[int, Views | None]:
+        return one.number, None if one.settled is None else network.look_twice(one.image, *one.settled)
+
+    return ahead(views_of, _followed(video, numbers, start, detector, network))
+
+
+class _Followed(NamedTuple):
+    number: int
+    image: Image
+    settled: tuple[Region, View] | None
+
+
+def _followed(
+    video: Frames, numbers: list[int], start: Start, detector: Detector, network: LandmarkNetwork
+) -> Iterator[_Followed]:
     region: Region | None = None
     last = start.region
     for number in numbers:
@@ -92,14 +104,10 @@ def follow(
             region = start.region
         if region is None:
             region = _found_again(detector(image), last)
-        first = None if region is None else _settled(image, region, network)
-        if first is None or region is None:
-            region = None
-            yield number, None
-            continue
-        used, view = first
-        yield number, network.look_twice(image, used, view)
-        last = region = view.next_region
+        settled = None if region is None else _settled(image, region, network)
+        yield _Followed(number, image, settled)
+        region = None if settled is None else settled[1].next_region
+        last = region or last
 
 
 def _settled(image: Image, region: Region, network: LandmarkNetwork) -> tuple[Region, View] | None:
