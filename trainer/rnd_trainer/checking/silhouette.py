@@ -67,7 +67,7 @@ def _nearest_faces(
     return local, visible, nearest
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def z_buffer(pixels, inverse_depth, faces, width, height):
     """Index [H, W] of the nearest face at each pixel centre, −1 without one."""
     nearest = np.full((height, width), -1, np.int64)

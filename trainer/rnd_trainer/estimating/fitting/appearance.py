@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rnd_trainer.checking.silhouette import z_buffer
 from rnd_trainer.estimating.flow import LUCAS_KANADE, SIDE, TEXTURE, ZOOM, texture, tracked
 from rnd_trainer.estimating.observations import GreyImages
+from rnd_trainer.importing.ahead import ahead
 
 from .kinematics import Posed
 from .normal_equations import NormalEquations
@@ -112,21 +113,30 @@ def appearance_term(
     faces = surface.figure.body.faces.astype(np.int64)
     metre = state.focal / np.maximum(-posed.joints[:, 0, 2], 0.1)  # px
     keys = np.unique(np.linspace(0, frames - 1, min(frames, KEY_FRAMES)).round().astype(int))
-    views = {int(key): _view(surface, state, posed, lens, images[int(key)], int(key), faces) for key in keys}
+
+    def view_of(frame: int) -> View:
+        return _view(surface, state, posed, lens, images[frame], frame, faces)
+
+    views = dict(zip(keys.tolist(), ahead(view_of, keys.tolist())))
     shown = np.stack([_shown(view, len(faces)) for view in views.values()])
     rng = np.random.default_rng(0)
     term = AppearanceTerm(
         surface, np.zeros((frames, POINTS), np.int64), np.zeros((frames, POINTS, 2)), np.zeros((frames, POINTS)), weight
     )
-    for k in range(frames):
-        view = views.get(k) or _view(surface, state, posed, lens, images[k], k, faces)
-        others = keys[_alike(_shown(view, len(faces)), shown, keys != k)]
-        vertices, pixels = surface.visible(state, posed, lens, k)
-        moved = _moved(view, [views[int(other)] for other in others], faces, view.to_image(pixels)) / view.scale
+
+    def compared(frame: int) -> tuple[Ints, Floats, Floats, float]:
+        """Visible vertices, their pixels, how far from these the image has them, and its scale."""
+        view = views.get(frame) or view_of(frame)
+        others = keys[_alike(_shown(view, len(faces)), shown, keys != frame)]
+        vertices, pixels = surface.visible(state, posed, lens, frame)
+        moved = _moved(view, [views[int(other)] for other in others], faces, view.to_image(pixels))
+        return vertices, pixels, moved / view.scale, view.scale
+
+    for k, (vertices, pixels, moved, scale) in enumerate(ahead(compared, range(frames))):
         chosen = spaced(pixels, np.flatnonzero(np.isfinite(moved).all(1)), metre[k], rng)
         here = slice(0, len(chosen))
         term.vertices[k, here], term.pixels[k, here] = vertices[chosen], pixels[chosen] + moved[chosen]
-        term.inverse[k, here] = 1 / np.hypot(_DEVIATION_PX / view.scale, _DEVIATION_M * metre[k])
+        term.inverse[k, here] = 1 / np.hypot(_DEVIATION_PX / scale, _DEVIATION_M * metre[k])
         on_progress((k + 1) / frames)
     return term
 
@@ -209,7 +219,7 @@ def _moved(view: View, others: list[View], faces: NDArray[np.int64], points: Flo
     return moved
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _shares(x, y, points, face):
     """Barycentric coordinates of a pixel in a face."""
     ax, ay = points[face[0], 0], points[face[0], 1]
@@ -221,7 +231,7 @@ def _shares(x, y, points, face):
     return u, v, 1 - u - v
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _mixed(u, v, w, points, face):
     """The point of a face with these barycentric coordinates."""
     i, j, k = face[0], face[1], face[2]
@@ -230,7 +240,7 @@ def _mixed(u, v, w, points, face):
     return x, y, u * points[i, 2] + v * points[j, 2] + w * points[k, 2]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _depth(nearest, faces, points):
     """Depths [h, w], m, of the faces ``nearest``; infinite without one."""
     depth = np.full(nearest.shape, np.inf, np.float32)
@@ -243,7 +253,7 @@ def _depth(nearest, faces, points):
     return depth
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _add_other(nearest, faces, points, other_points, other_depth, other_grey, other_facing, total, weight, count):
     """Add to ``total``, ``weight`` and ``count`` what another frame shows of the faces at each pixel."""
     height, width = other_grey.shape

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from rnd_trainer.importing.ahead import ahead
+
 from .kinematics import Posed
 from .normal_equations import NormalEquations
 from .state import Layout, State
@@ -56,26 +58,30 @@ def outlines_of(masks, frames: int, size: tuple[int, int], seed: int = 0) -> Out
     points, normals = np.zeros((frames, SAMPLES, 2)), np.zeros((frames, SAMPLES, 2))
     seen, distance = np.zeros((frames, SAMPLES)), np.zeros((frames, grid[1], grid[0]), np.float32)
     rng = np.random.default_rng(seed)
-    for k in range(frames):
-        mask = np.asarray(masks[k])
-        binary = _largest(mask > 127)
-        away = cv2.distanceTransform(1 - binary, cv2.DIST_L2, 5)
-        distance[k] = cv2.resize(away, grid, interpolation=cv2.INTER_AREA)
-        found, _ = cv2.findContours(binary, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-        lines = [line[:, 0] for line in found if len(line) > 30]
-        line = np.concatenate(lines) if lines else np.zeros((0, 2), np.int32)
+    every = ahead(lambda k: _outline(np.asarray(masks[k]), grid), range(frames))
+    for k, (away, line, slope) in enumerate(every):
+        distance[k] = away
         inner = (line >= BORDER).all(1) & (line[:, 0] < width - BORDER) & (line[:, 1] < height - BORDER)
-        line = line[inner]
+        line, slope = line[inner], slope[inner]
         if len(line) < SAMPLES // 4:
             continue
-        smooth = cv2.GaussianBlur(binary.astype(np.float32), (0, 0), max(1.5, 0.004 * max(size)))
-        slope = np.stack([cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)], -1)
-        chosen = line[rng.choice(len(line), SAMPLES, replace=len(line) < SAMPLES)]
-        outward = -slope[chosen[:, 1], chosen[:, 0]].astype(np.float64)
+        chosen = rng.choice(len(line), SAMPLES, replace=len(line) < SAMPLES)
+        outward = -slope[chosen].astype(np.float64)
         length = np.linalg.norm(outward, axis=1, keepdims=True)
-        points[k], normals[k] = chosen + 0.5, outward / np.maximum(length, 1e-9)
+        points[k], normals[k] = line[chosen] + 0.5, outward / np.maximum(length, 1e-9)
         seen[k] = length[:, 0] > 1e-6
     return Outlines(points, normals, seen, distance, scale)
+
+
+def _outline(mask: NDArray[np.uint8], grid: tuple[int, int]) -> tuple[NDArray[np.float32], Ints, NDArray[np.float32]]:
+    """Distances from a mask on ``grid`` (width, height), its outlines' pixels [N, 2] and its slope there [N, 2]."""
+    binary = _largest(mask > 127)
+    away = cv2.resize(cv2.distanceTransform(1 - binary, cv2.DIST_L2, 5), grid, interpolation=cv2.INTER_AREA)
+    found, _ = cv2.findContours(binary, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    line = np.concatenate([np.zeros((0, 2), np.int64), *(line[:, 0] for line in found if len(line) > 30)])
+    smooth = cv2.GaussianBlur(binary.astype(np.float32), (0, 0), max(1.5, 0.004 * max(mask.shape)))
+    slope = np.stack([cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)], -1)
+    return away, line, slope[line[:, 1], line[:, 0]]
 
 
 def _largest(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -62,7 +62,7 @@ class Surface:
         self.blend = np.zeros(body.skinning_weights.shape)
         np.put_along_axis(self.blend, self.bones, self.weights, 1)
         self.inner = _spread(body.vertices, INNER)
-        self._shape, self._vertices = np.zeros(len(figure.names)), body.vertices
+        self._kept = np.zeros(len(figure.names)), body.vertices
 
     def whole(self, state: State, posed: Posed, frame: int) -> Floats:
         """Positions [V, 3] of all vertices in one frame, in the fit's world."""
@@ -116,9 +116,11 @@ class Surface:
 
     def _rest(self, shape: Floats) -> Floats:
         """All vertices [V, 3] at rest; the last shape's are kept for the other frames and terms of a step."""
-        if not np.array_equal(shape, self._shape):
-            self._shape, self._vertices = shape.copy(), self.figure.shaped(shape).vertices
-        return self._vertices
+        kept, vertices = self._kept
+        if not np.array_equal(shape, kept):
+            vertices = self.figure.shaped(shape).vertices
+            self._kept = shape, vertices
+        return vertices
 
     def _blended(self, posed: Posed, frame: int, vertices: Ints | slice = slice(None)) -> Floats:
         """Transforms [P, 3, 4] of ``vertices`` [P] in one frame, by linear blend skinning."""
