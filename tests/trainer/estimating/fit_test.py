@@ -22,10 +22,10 @@ from rnd_trainer.estimating.fitting.normal_equations import NormalEquations
 from rnd_trainer.estimating.fitting.pose_terms import BalanceTerm, _soles
 from rnd_trainer.estimating.fitting.silhouette import INSET_M, outlines_of
 from rnd_trainer.estimating.fitting.state import TO_CAMERA
-from rnd_trainer.estimating.fitting.terms import project
+from rnd_trainer.estimating.fitting.terms import mark_points, project
 from rnd_trainer.estimating.flow import CELLS, Flow, flow_of
 from rnd_trainer.estimating.lifted import JOINTS, PARENTS, REST_DIRECTIONS, ROLL_AXES, Lifted
-from rnd_trainer.estimating.observations import GreyImages, Observations, only_person
+from rnd_trainer.estimating.observations import BLAZEPOSE, GreyImages, Observations, only_person
 
 FRAMES, SIZE, FOCAL, FPS = 16, 200, 260.0, 15.0
 HANGING = 0.8
@@ -287,6 +287,26 @@ def test_derivatives_agree_with_differences(person, term, part):
 def parts_of(lifted: Lifted, count: int) -> Lifted:
     names = ("directions", "concentration", "roll", "roll_concentration")
     return Lifted(*(getattr(lifted, name)[:count] for name in names))
+
+
+def test_a_leg_behind_somebody_is_not_pulled_out(person):
+    few, lifted = person[0].select(np.arange(4)), parts_of(person[1], 4)
+    ankle = BLAZEPOSE.index("left_ankle")
+    behind = np.zeros((4, SIZE, SIZE), np.uint8)
+    for image, (x, y) in zip(behind, few.keypoints_px[:, ankle].astype(int)):
+        image[y - 14 : y + 20, x - 9 : x + 25] = 255
+    masks = GreyImages.of((np.where(h > 0, 0, mask) for h, mask in zip(behind, few.masks)), few.image_size)
+    confidence = few.confidence.copy()
+    confidence[:, [k for k, name in enumerate(BLAZEPOSE) if name.startswith("left") and k > 24]] = 0.01
+    errors = []
+    for hidden in (None, GreyImages.of(behind, few.image_size)):
+        seen = replace(few, masks=masks, confidence=confidence, hidden=hidden)
+        fit = Fit(seen, lifted, default_figure(), _lens(seen, FOCAL, None), None)
+        for _ in range(8):
+            fit.advance(Stage(1, surface=True))
+        pixels, _ = project(mark_points(fit.state, fit.state.posed(fit.figure), fit.marks), fit.state, fit.lens)
+        errors.append(np.linalg.norm(pixels[:, ankle] - few.keypoints_px[:, ankle], axis=-1).mean())
+    assert errors[1] < 4 < errors[0]
 
 
 def test_a_frame_out_of_place_is_told_by_what_others_show(person):

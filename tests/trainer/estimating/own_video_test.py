@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ from rnd_runtime.motion.motion import load_motion
 from rnd_trainer.checking.silhouette import mask_iou
 from rnd_trainer.commands import train as train_cli
 from rnd_trainer.estimating import own_video
+from rnd_trainer.estimating.observations import GreyImages
 from rnd_trainer.estimating.observing import networks
 from rnd_trainer.estimating.observing.frame_rate import Regular, regular
 from rnd_trainer.estimating.observing.observe import MIN_FRAMES
@@ -31,14 +33,16 @@ from support.filmed_person import FPS, filmed_person
 from support.layouts import write_video
 from support.paths import SHARED
 
-FRAMES = 24
+FRAMES, BEHIND = 24, 5
 IOU = 0.93  # of the masks by the real networks; 0.970 on all 100 frames over an HDR image
 
 
 @pytest.fixture
 def film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A video, and networks that see exactly what is in it."""
+    """A video, and networks that see exactly what is in it, and in frame ``BEHIND`` that somebody is in front."""
     frames, observations = filmed_person(FRAMES)
+    hidden = (np.full(mask.shape, 255 if k == BEHIND else 0, np.uint8) for k, mask in enumerate(observations.masks))
+    observations = replace(observations, hidden=GreyImages.of(hidden, observations.image_size))
     write_video(tmp_path / "me.mp4", frames, fps=int(FPS))
     monkeypatch.setattr(own_video.Networks, "open", classmethod(lambda cls: SimpleNamespace(detector=lambda image: [])))
     monkeypatch.setattr(own_video, "observe", lambda *args, **options: observations)
@@ -53,6 +57,8 @@ def test_a_video_becomes_a_capture_and_trains(film: Path, tmp_path: Path, capsys
     assert "a person in 24 of 24 frames" in printed and "pixels tall" in printed
     capture = load_capture(out / "capture")
     assert {frame.split for frame in capture.frames} == {"train", "novel_pose"}
+    assert {frame.frame for frame in capture.frames} == set(range(FRAMES)) - {BEHIND}
+    assert f"1 of {FRAMES} frames are not trained on: behind somebody" in (capture.folder / "capture.json").read_text()
     assert capture.motion.frame_count == FRAMES
     assert load_uncertainty(out / "capture", FRAMES, len(capture.body.skeleton)) is not None
     with av.open(str(out / "capture" / "check" / "overlay.mp4")) as overlay:

@@ -226,7 +226,8 @@ class Fit:
 
     def _outline_term(self) -> OutlineTerm:
         if self.outlines is None:
-            self.outlines = outlines_of(self.observations.masks, len(self.observations), self.observations.image_size)
+            o = self.observations
+            self.outlines = outlines_of(o.masks, len(o), o.image_size, o.hidden)
         posed = self.state.posed(self.figure)
         matches = rim_matches(self.surface, self.state, posed, self.lens, self.outlines)
         w, scale = self.weights, self._scale()

@@ -127,6 +127,7 @@ class Observations:
         masks: [T, H, W] coverage.
         flow: how the person's image moves between frames, where that was measured.
         person: grey levels [T, H, W] of the person, 0 elsewhere, where they were kept.
+        hidden: [T, H, W], 255 where somebody else may hide the person; None where nobody was near.
     """
 
     fps: float
@@ -141,6 +142,7 @@ class Observations:
     masks: GreyImages
     flow: tuple[Flow, ...] = ()
     person: GreyImages | None = None
+    hidden: GreyImages | None = None
 
     def __post_init__(self) -> None:
         count, points, hands = len(self.frames), len(BLAZEPOSE), HAND_POINTS
@@ -164,11 +166,12 @@ class Observations:
     def select(self, frames: NDArray[Any] | list[int]) -> Observations:
         """The observations of some of the T frames, given as a mask or as ascending indices; without their flow."""
         arrays = {name: getattr(self, name)[frames] for name in _ARRAYS}
-        person = self.person and self.person.select(frames)
-        return Observations(self.fps, self.image_size, masks=self.masks.select(frames), person=person, **arrays)
+        images = {name: (kept := getattr(self, name)) and kept.select(frames) for name in _IMAGES}
+        return Observations(self.fps, self.image_size, **images, **arrays)
 
 
-_ARRAYS = tuple(f.name for f in fields(Observations) if f.name not in ("fps", "image_size", "masks", "flow", "person"))
+_IMAGES = ("masks", "person", "hidden")
+_ARRAYS = tuple(f.name for f in fields(Observations) if f.name not in ("fps", "image_size", "flow", *_IMAGES))
 
 
 def only_person(image: Image, mask: Image) -> Image:
@@ -183,7 +186,7 @@ def save_observations(path: str | Path, observations: Observations) -> None:
     arrays["hands_px"] = np.nan_to_num(observations.hands_px)  # readers refuse NaN; hands_confidence says where it is
     arrays["fps"] = np.array(observations.fps)
     arrays["image_size"] = np.array(observations.image_size)
-    for name in ("masks", "person"):
+    for name in _IMAGES:
         if images := getattr(observations, name):
             arrays[f"{name}_png"] = np.frombuffer(b"".join(one.png for one in images.encoded), np.uint8)
             arrays[f"{name}_ends"] = np.cumsum([len(one.png) for one in images.encoded], dtype=np.int64)
@@ -219,6 +222,7 @@ def load_observations(path: str | Path) -> Observations:
             hands_px=hands.astype(np.float32),
             masks=_images(archive, "masks", count, (width, height)),
             person=_images(archive, "person", count, (width, height)) if "person_png" in archive.names else None,
+            hidden=_images(archive, "hidden", count, (width, height)) if "hidden_png" in archive.names else None,
             flow=tuple(_flow(archive, gap, count) for gap in gaps),
             **{name: array.astype(np.float32) for name, array in numbers.items()},
         )

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.capture.body import posed_vertices
 from rnd_runtime.cli.lock import folder_lock
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import output_folder
 from rnd_runtime.core.rotations import slerp_matrices
 from rnd_runtime.motion.motion import Motion
+from rnd_trainer.checking.silhouette import silhouette
+from rnd_trainer.checking.views import shrunk_camera
 from rnd_trainer.importing.body_models import load_body_model
 from rnd_trainer.importing.dataset import ImportedDataset, Lens, Sample
 from rnd_trainer.importing.importer import check_numbers, find_layout, refuse_occupied, refuse_unwritable
@@ -36,9 +41,11 @@ from .observations import Observations
 from .observing.camera_motion import Steady, steady
 from .observing.frame_rate import Regular, regular
 from .observing.observe import MIN_FRAMES, Networks, observe
-from .overlay import write_overlay
+from .overlay import SIDE, write_overlay
 
 Floats = NDArray[np.float64]
+
+_HIDDEN = 0.02  # share of the body's silhouette behind others from which a frame is not trained on
 
 
 def is_own_video(source: Path, options: ImportOptions) -> bool:
@@ -89,7 +96,7 @@ def import_video(
         raise error.at(file=source) from error
     on_found(f"a person in {len(seen)} of {len(numbers)} frames")
     fitted = _fitted(seen, options, on_progress)
-    left_out = dict.fromkeys(seen.frames[cut_off(seen)].tolist(), "cut off by the image")
+    left_out = _left_out(seen, fitted)
     notes = [*_video_notes(video, numbers, seen, left_out), *fitted.notes]
     notes += film_notes(seen, facing(fitted), video.frame)
     scene, dataset = _placed(seen, fitted, options, notes)
@@ -214,9 +221,24 @@ def _video_notes(video: Any, numbers: list[int], seen: Observations, left_out: d
     missing = len(numbers) - len(seen)
     if missing:
         notes.append(f"{missing} of {len(numbers)} frames left out: the person was not seen")
-    if left_out:
-        notes.append(f"{len(left_out)} of {len(seen)} frames are not trained on: cut off by the image")
+    for reason, count in Counter(left_out.values()).items():
+        notes.append(f"{count} of {len(seen)} frames are not trained on: {reason}")
     return notes
+
+
+def _left_out(seen: Observations, fitted: Estimate) -> dict[int, str]:
+    """Why frames are not trained on, by their numbers."""
+    reasons = dict.fromkeys(seen.frames[cut_off(seen)].tolist(), "cut off by the image")
+    if seen.hidden is None:
+        return reasons
+    small = shrunk_camera(fitted.camera, SIDE)
+    for k, number in enumerate(seen.frames.tolist()):
+        hidden = cv2.resize(seen.hidden[k], (small.width, small.height), interpolation=cv2.INTER_AREA) > 127
+        vertices = posed_vertices(fitted.body, fitted.motion.rotations[k], fitted.motion.translations[k])
+        covered = silhouette(vertices, fitted.body.faces, small)
+        if (covered & hidden).sum() > _HIDDEN * covered.sum():
+            reasons.setdefault(number, "behind somebody")
+    return reasons
 
 
 def _deviations(fitted: Estimate) -> PoseUncertainty:

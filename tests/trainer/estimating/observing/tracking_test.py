@@ -96,6 +96,12 @@ def test_a_person_is_chosen_among_all_that_the_message_counts() -> None:
     assert [round(start_of(images, person=k).region.x) for k in range(3)] == [30, 80, 150]
 
 
+def test_people_of_like_size_may_hide_the_person() -> None:
+    images = [image((30, 20), (80, 60), (150, 56))] * COUNT
+    assert [round(one.x) for one in start_of(images, person=1).others] == [150]
+    assert start_of([image((60, 80), (150, 30))] * COUNT).others == ()
+
+
 def test_several_detections_of_one_person_are_one_person() -> None:
     def twice(pixels: np.ndarray) -> list[Detection]:
         return [found for one in blocks(pixels) for found in (one, Detection(one.region.scaled(0.6), 0.5))]

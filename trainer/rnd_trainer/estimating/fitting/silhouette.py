@@ -19,6 +19,7 @@ from .terms import Lens, project, robust
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Image = NDArray[np.uint8]
 
 SAMPLES = 120
 """points of an outline"""
@@ -40,7 +41,7 @@ class Outlines:
 
     Attributes:
         points: [T, SAMPLES, 2] px; normals: [T, SAMPLES, 2], outwards; seen: [T, SAMPLES], 0 where there is none.
-        distance: [T, h, w] px from the mask, on a grid of ``scale`` cells a pixel.
+        distance: [T, h, w] px from the mask and from what may hide the person, on a grid of ``scale`` cells a pixel.
     """
 
     points: Floats
@@ -50,15 +51,18 @@ class Outlines:
     scale: float
 
 
-def outlines_of(masks, frames: int, size: tuple[int, int], seed: int = 0) -> Outlines:
-    """Outlines of ``masks`` (T × [H, W] uint8 soft) of images of ``size`` (width, height)."""
+def outlines_of(masks, frames: int, size: tuple[int, int], hidden=None, seed: int = 0) -> Outlines:
+    """Outlines of ``masks`` (T × [H, W] uint8 soft) of images of ``size`` (width, height).
+
+    Where somebody may hide the person (``hidden``, like ``masks``), a mask's border is no outline.
+    """
     width, height = size
     scale = min(1.0, GRID / max(width, height))
     grid = max(1, round(width * scale)), max(1, round(height * scale))
     points, normals = np.zeros((frames, SAMPLES, 2)), np.zeros((frames, SAMPLES, 2))
     seen, distance = np.zeros((frames, SAMPLES)), np.zeros((frames, grid[1], grid[0]), np.float32)
     rng = np.random.default_rng(seed)
-    every = ahead(lambda k: _outline(np.asarray(masks[k]), grid), range(frames))
+    every = ahead(lambda k: _outline(masks[k], None if hidden is None else hidden[k], grid), range(frames))
     for k, (away, line, slope) in enumerate(every):
         distance[k] = away
         inner = (line >= BORDER).all(1) & (line[:, 0] < width - BORDER) & (line[:, 1] < height - BORDER)
@@ -73,12 +77,17 @@ def outlines_of(masks, frames: int, size: tuple[int, int], seed: int = 0) -> Out
     return Outlines(points, normals, seen, distance, scale)
 
 
-def _outline(mask: NDArray[np.uint8], grid: tuple[int, int]) -> tuple[NDArray[np.float32], Ints, NDArray[np.float32]]:
+def _outline(
+    mask: Image, hidden: Image | None, grid: tuple[int, int]
+) -> tuple[NDArray[np.float32], Ints, NDArray[np.float32]]:
     """Distances from a mask on ``grid`` (width, height), its outlines' pixels [N, 2] and its slope there [N, 2]."""
-    binary = _largest(mask > 127)
-    away = cv2.resize(cv2.distanceTransform(1 - binary, cv2.DIST_L2, 5), grid, interpolation=cv2.INTER_AREA)
+    allowed = _largest((mask if hidden is None else np.maximum(mask, hidden)) > 127)
+    binary = allowed & (mask > 127)
+    away = cv2.resize(cv2.distanceTransform(1 - allowed, cv2.DIST_L2, 5), grid, interpolation=cv2.INTER_AREA)
     found, _ = cv2.findContours(binary, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     line = np.concatenate([np.zeros((0, 2), np.int64), *(line[:, 0] for line in found if len(line) > 30)])
+    if hidden is not None:
+        line = line[cv2.dilate(hidden, np.ones((2 * BORDER + 1,) * 2, np.uint8))[line[:, 1], line[:, 0]] <= 127]
     smooth = cv2.GaussianBlur(binary.astype(np.float32), (0, 0), max(1.5, 0.004 * max(mask.shape)))
     slope = np.stack([cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)], -1)
     return away, line, slope[line[:, 1], line[:, 0]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,21 +14,23 @@ from rnd_runtime.core.errors import InputError
 from rnd_trainer.estimating.flow import flow_of
 from rnd_trainer.estimating.observations import GreyImages, Observations, only_person
 from rnd_trainer.importing.ahead import ahead
+from rnd_trainer.importing.surfaces.masks import dilated
 
 from .detection import Detector
 from .hands import HandNetwork, Hands
 from .landmarks import LandmarkNetwork, Views
 from .masks import refine_masks
 from .networks import open_network
-from .regions import Floats, Image
+from .regions import Floats, Image, Region
 from .sides import Merged, merge_views
-from .tracking import Frames, find_person, follow
+from .tracking import Frames, Start, find_person, follow
 
 OnProgress = Callable[[str, int, int], None]
 """called with (phase, done, total)"""
 
 MIN_FRAMES = 20
 _WIDER = 1.12  # of the region, in the views without a background
+_NEAR, _CLEARANCE = 0.5, 0.01  # of the height: how far others matter, and how far their masks are off
 _AROUND = 0.02  # of the person's size: margin of the mask when the background is taken away
 
 
@@ -86,26 +88,30 @@ def observe(
     for done, (number, views) in enumerate(follow(video, numbers, start, networks.detector, networks.landmarks)):
         if views is not None:
             frames.append(number)
-            soft.append(np.round(255 * views.mask).astype(np.uint8))
+            soft.append(_bytes(views.mask))
             first.append(views.without_mask())
         on_progress("landmarks", done + 1, len(numbers))
     if len(frames) < MIN_FRAMES:
         raise InputError("frames with the person in view", expected=f"at least {MIN_FRAMES}", got=len(frames))
-    masks, person_alone = GreyImages([], soft.image_size), GreyImages([], soft.image_size)
+    regions = {number: views.region for number, views in zip(frames, first)}
+    others = [_other(video, numbers, Start(start.frame, one), networks, regions, on_progress) for one in start.others]
+    masks, person_alone, hidden = (GreyImages([], soft.image_size) for _ in range(3))
     second, outside = [], []
 
-    def look_again(one: tuple[tuple[Image, Image], Views]) -> tuple[Image, Image, Views]:
-        (image, mask), views = one
-        alone = _alone(image, mask, views.region.size)
-        again = networks.landmarks.look_twice(alone, views.region.scaled(_WIDER))
-        return mask, only_person(image, mask), again.without_mask()
+    def look_again(one: tuple[int, tuple[Image, Image]]) -> tuple[Image, Image, Image, Views]:
+        k, (image, mask) = one
+        mask, behind = _apart(mask, soft[k], [masks[k] for masks in others])
+        alone = _alone(image, np.maximum(mask, behind), first[k].region.size)
+        again = networks.landmarks.look_twice(alone, first[k].region.scaled(_WIDER))
+        return mask, behind, only_person(image, mask), again.without_mask()
 
     refined = refine_masks(lambda k: video.frame(frames[k]), soft, lambda k, n: on_progress("masks", k, n))
-    for k, (mask, grey, views) in enumerate(ahead(look_again, zip(refined, first))):
+    for k, (mask, behind, grey, views) in enumerate(ahead(look_again, enumerate(refined))):
         masks.append(mask)
+        hidden.append(behind)
         person_alone.append(grey)
         second.append(views)
-        outside.append(_outside(mask, np.concatenate([first[k].points, views.points])))
+        outside.append(_outside(np.maximum(mask, behind), np.concatenate([first[k].points, views.points])))
     merged = _merged(first, second, np.stack(outside), np.array(frames) / video.fps)
     hands = _hands(video, frames, merged, networks.hands, on_progress)
     rate = video.fps / float(np.median(np.diff(frames)))
@@ -123,7 +129,41 @@ def observe(
         masks=masks,
         flow=flow,
         person=person_alone,
+        hidden=hidden if others else None,
     )
+
+
+def _other(
+    video: Clip,
+    numbers: list[int],
+    start: Start,
+    networks: Networks,
+    regions: Mapping[int, Region],
+    on_progress: OnProgress,
+) -> GreyImages:
+    """Masks of who is at ``start`` in the frames of ``regions``, the followed person's; black where they are one."""
+    masks = GreyImages([], (video.width, video.height))
+    for done, (number, views) in enumerate(follow(video, numbers, start, networks.detector, networks.landmarks)):
+        on_progress("other people", done + 1, len(numbers))
+        if number in regions:
+            here = None if views is None or views.region.same_person(regions[number]) else views.mask
+            masks.append(np.zeros(masks.shape[1:], np.uint8) if here is None else _bytes(here))
+    return masks
+
+
+def _bytes(mask: NDArray[np.float32]) -> Image:
+    return np.round(255 * mask).astype(np.uint8)
+
+
+def _apart(mask: Image, soft: Image, others: list[Image]) -> tuple[Image, Image]:
+    """``mask`` without ``others``, and where near it they may hide the person, 255; ``soft`` is the network's mask."""
+    if not others:
+        return mask, np.zeros_like(mask)
+    other = np.maximum.reduce(others)
+    theirs = (other > 127) & (other > soft)
+    mask = np.where(theirs, np.uint8(0), mask)
+    near = dilated(mask > 127, _NEAR) & dilated(theirs, _CLEARANCE) & (mask == 0)
+    return mask, np.where(near, np.uint8(255), np.uint8(0))
 
 
 def _merged(first: list[Views], second: list[Views], outside: Floats, seconds: Floats) -> Merged:

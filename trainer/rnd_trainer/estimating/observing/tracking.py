@@ -37,10 +37,11 @@ class Frames(Protocol):
 
 @dataclass(frozen=True)
 class Start:
-    """Where the person is first seen."""
+    """Where the person is first seen, and people there who may hide the person."""
 
     frame: int
     region: Region
+    others: tuple[Region, ...] = ()
 
 
 def find_person(
@@ -66,14 +67,17 @@ def find_person(
     if person is not None:
         if person >= len(row):
             raise InputError("--person", expected=f"0 to {len(row) - 1}, counted from the left", got=person)
-        return Start(number, row[person])
+        return _start(number, row[person], row)
     if len(several) > _OFTEN * len(seen):
         places = ", ".join(f"{k} at x = {one.x:.0f}" for k, one in enumerate(row))
         raise InputError(
             "people", expected="one", got=f"{len(row)}", frame=number, hint=f"choose by --person: {places}"
         )
-    number = next(iter(seen))
-    return Start(number, seen[number][0])
+    return _start(number, seen[number][0], row)
+
+
+def _start(frame: int, person: Region, people: list[Region]) -> Start:
+    return Start(frame, person, tuple(one for one in people if one is not person and one.size >= _ALIKE * person.size))
 
 
 def follow(

@@ -1,0 +1,23 @@
+"""What is seen of a person beside others."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from rnd_trainer.estimating.observing.observe import _apart
+
+
+def disc(x: int) -> np.ndarray:
+    return cv2.GaussianBlur(cv2.circle(np.zeros((100, 140), np.uint8), (x, 50), 30, 255, -1), (0, 0), 2)
+
+
+def test_a_mask_ends_where_somebody_else_begins() -> None:
+    mine, theirs = disc(40), disc(85)
+    spilled = np.maximum(mine, np.where(np.arange(140) < 70, theirs, 0).astype(np.uint8))
+    mask, hidden = _apart(spilled, mine, [np.zeros_like(mine), theirs])
+    assert np.abs(mask.astype(int) - mine)[:, :55].max() == 0 and mask[:, 68:].max() < 128
+    assert hidden[50, 68:85].min() == 255 and hidden[:, :50].max() == 0 and hidden[:, 110:].max() == 0
+    assert not (np.minimum(mask, hidden) > 127).any()
+    alone, nothing = _apart(spilled, mine, [])
+    assert alone is spilled and not nothing.any()
