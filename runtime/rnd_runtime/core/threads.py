@@ -1,10 +1,17 @@
-"""How many threads a process takes: by default one for each core that it may use."""
+"""How many threads a process takes, by default one for each core that it may use, and work shared between them."""
 
 from __future__ import annotations
 
 import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
 
 from .errors import InputError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 def cores() -> int:
@@ -38,3 +45,24 @@ def set_threads(threads: int | None) -> None:
 
         check_threads(threads)
         numba.set_num_threads(threads)
+
+
+def ahead(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """Yield ``function`` of each of ``items``, in their order; a thread a core works on the next ones.
+
+    ``items`` are taken in the caller's thread, so many at a time as there are cores; exceptions come when their turn
+    does.
+    """
+    count = cores()
+    with ThreadPoolExecutor(count) as pool:
+        waiting: deque[Future[Result]] = deque()
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) > count:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -30,6 +31,9 @@ from rnd_trainer.estimating.fitting.marks import marks_of
 from rnd_trainer.estimating.fitting.state import TO_CAMERA
 from rnd_trainer.estimating.fitting.terms import mark_points
 from rnd_trainer.estimating.observations import BLAZEPOSE, Observations
+from rnd_trainer.estimating.own_video import import_video
+from rnd_trainer.importing.options import ImportOptions
+from rnd_trainer.importing.videos.video_file import VideoFile
 
 from .video_options import Video
 
@@ -54,11 +58,15 @@ def run(options: Video) -> None:
             progress.phase(video.stem)
             seen = observed(video, out / f"{video.stem}.npz")
             rows += [{"video": video.stem, **row} for row in _rendered(load_capture(folder), seen)]
+        films = list(options.video)
         if options.real is not None:
             progress.phase("real cameras")
             rows += list(_real(options.real, out))
+            films += [options.real / "videos" / f"{name}.mp4" for name in SCORED]
+        progress.phase("imports")
+        imports = [import_times(film, out) for film in films]
     if options.json is not None:
-        write_json(options.json, {"machine": machine(), "rows": rows})
+        write_json(options.json, {"machine": machine(), "rows": rows, "imports": imports})
     figures = ("absolute_mm", "root_relative_mm", "pa_mm", "mask_iou", "outline_iou", "seconds_a_frame")
     table = Table("video", "given", *figures)
     for row in rows:
@@ -120,6 +128,18 @@ def _real(folder: Path, out: Path) -> Iterator[dict[str, Any]]:
             "true_focal_px": float(cameras[name].intrinsics[0, 0]),
             "seconds_a_frame": seconds,
         }
+
+
+def import_times(film: Path, out: Path) -> dict[str, Any]:
+    """Seconds that a video alone takes to become a capture, networks included, and seconds of CPU a frame."""
+    video = VideoFile(film)
+    with TemporaryDirectory(dir=out) as folder:
+        start, used = time.perf_counter(), time.process_time()
+        import_video(film, Path(folder) / "capture", ImportOptions())
+        seconds, used = time.perf_counter() - start, time.process_time() - used
+    count = len(video.numbers)
+    size = [video.width, video.height]
+    return {"video": film.stem, "size": size, "frames": count, "seconds": seconds, "cpu_seconds_a_frame": used / count}
 
 
 def _in_camera(points: Floats, camera: Camera) -> Floats:

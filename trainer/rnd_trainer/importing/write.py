@@ -15,8 +15,8 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import output_folder
 from rnd_runtime.core.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
+from rnd_runtime.core.threads import ahead
 
-from .ahead import ahead
 from .dataset import ImportedDataset, Sample
 from .images import Bytes, check_size
 from .options import OnProgress, no_progress

@@ -14,10 +14,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.core.threads import ahead
 from rnd_trainer.checking.silhouette import z_buffer
 from rnd_trainer.estimating.flow import LUCAS_KANADE, SIDE, TEXTURE, ZOOM, texture, tracked
 from rnd_trainer.estimating.observations import GreyImages
-from rnd_trainer.importing.ahead import ahead
 
 from .kinematics import Posed
 from .normal_equations import NormalEquations

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from rnd_trainer.importing.ahead import ahead
+from rnd_runtime.core.threads import ahead
 
 from .kinematics import Posed
 from .normal_equations import NormalEquations

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.arrays import spaced_indices
-from rnd_trainer.importing.ahead import ahead
+from rnd_runtime.core.threads import ahead
 from rnd_trainer.importing.surfaces.masks import (
     Floats32,
     bounding_box,

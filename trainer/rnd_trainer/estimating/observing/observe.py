@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.threads import ahead
 from rnd_trainer.estimating.flow import flow_of
 from rnd_trainer.estimating.observations import GreyImages, Observations, only_person
-from rnd_trainer.importing.ahead import ahead
 from rnd_trainer.importing.surfaces.masks import dilated
 
 from .detection import Detector

@@ -11,7 +11,7 @@ import numpy as np
 
 from rnd_runtime.core.arrays import spaced_indices
 from rnd_runtime.core.errors import InputError
-from rnd_trainer.importing.ahead import ahead
+from rnd_runtime.core.threads import ahead
 
 from .detection import Detection, Detector
 from .landmarks import SIDE, LandmarkNetwork, View, Views
