@@ -100,7 +100,7 @@ def observe(
 
     def look_again(one: tuple[int, tuple[Image, Image]]) -> tuple[Image, Image, Image, Views]:
         k, (image, mask) = one
-        mask, behind = _apart(mask, soft[k], [masks[k] for masks in others])
+        mask, behind = _apart(mask, soft[k], [other[k] for other in others])
         alone = _alone(image, np.maximum(mask, behind), first[k].region.size)
         again = networks.landmarks.look_twice(alone, first[k].region.scaled(_WIDER))
         return mask, behind, only_person(image, mask), again.without_mask()
