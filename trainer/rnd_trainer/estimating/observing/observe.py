@@ -156,11 +156,13 @@ def _bytes(mask: NDArray[np.float32]) -> Image:
 
 
 def _apart(mask: Image, soft: Image, others: list[Image]) -> tuple[Image, Image]:
-    """``mask`` without ``others``, and where near it they may hide the person, 255; ``soft`` is the network's mask."""
+    """``mask`` without ``others``, and where near it they may hide the person, 255; ``soft`` is the network's mask.
+
+    What is in both networks' masks is the person's: limbs in front stay whole.
+    """
     if not others:
         return mask, np.zeros_like(mask)
-    other = np.maximum.reduce(others)
-    theirs = (other > 127) & (other > soft)
+    theirs = (np.maximum.reduce(others) > 127) & (soft <= 127)
     mask = np.where(theirs, np.uint8(0), mask)
     near = dilated(mask > 127, _NEAR) & dilated(theirs, _CLEARANCE) & (mask == 0)
     return mask, np.where(near, np.uint8(255), np.uint8(0))
