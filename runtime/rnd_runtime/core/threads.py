@@ -6,11 +6,10 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from .errors import InputError
 
-Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
@@ -47,8 +46,8 @@ def set_threads(threads: int | None) -> None:
         numba.set_num_threads(threads)
 
 
-def ahead(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Yield ``function`` of each of ``items``, in their order; a thread a core works on the next ones.
+def ahead(function: Callable[..., Result], *items: Iterable[Any]) -> Iterator[Result]:
+    """Yield what ``map`` does, in its order; a thread a core works on the next ones.
 
     ``items`` are taken in the caller's thread, so many at a time as there are cores; exceptions come when their turn
     does.
@@ -57,8 +56,8 @@ def ahead(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator
     with ThreadPoolExecutor(count) as pool:
         waiting: deque[Future[Result]] = deque()
         try:
-            for item in items:
-                waiting.append(pool.submit(function, item))
+            for arguments in zip(*items):
+                waiting.append(pool.submit(function, *arguments))
                 if len(waiting) > count:
                     yield waiting.popleft().result()
             while waiting:

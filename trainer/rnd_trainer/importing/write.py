@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +44,9 @@ def write_capture(
     """
     output_folder(folder)
     first = int(dataset.poses.frames[0])
-    read = ((sample, _maps(sample, scene.cameras[sample.camera])) for sample in samples)
+    read = (_maps(sample, scene.cameras[sample.camera]) for sample in samples)
     frames = []
-    for frame in ahead(lambda one: _write_sample(folder, *one, first), read):
+    for frame in ahead(partial(_write_sample, folder, first), samples, read):
         frames.append(frame)
         on_progress("writing images", len(frames), len(samples))
     used = {name: scene.cameras[name] for name in dict.fromkeys(frame.camera for frame in frames)}
@@ -68,7 +69,7 @@ def _maps(sample: Sample, camera: Camera) -> dict[str, NDArray[Any]]:
         raise error.at(frame=sample.frame) from error
 
 
-def _write_sample(folder: Path, sample: Sample, maps: dict[str, NDArray[Any]], first: int) -> Frame:
+def _write_sample(folder: Path, first: int, sample: Sample, maps: dict[str, NDArray[Any]]) -> Frame:
     name = f"{sample.camera}_{sample.frame:06d}.png".replace(" ", "_").replace("/", "_")
     mask, normals, albedo = maps["mask"], maps.get("normals"), maps.get("albedo")
     write_image(folder / "images" / name, premultiplied(maps["image"], mask))

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import repeat
 from typing import Protocol
 
 import cv2
@@ -75,13 +76,11 @@ def refine_masks(
     scale = min(1.0, MAX_SIDE / max(heights, default=1))
     background = _learn_background(frame, soft, scale)
 
-    def refined(pair: tuple[Image, Image]) -> tuple[Image, Image]:
-        image, mask = pair
+    def refined(image: Image, mask: Image) -> tuple[Image, Image]:
         small = _matte(_resized(image, scale), _resized(mask, scale), background)
         return image, small if scale == 1 else _resized(small, (mask.shape[1], mask.shape[0]))
 
-    pairs = ((frame(k), mask) for k, mask in enumerate(soft))
-    for done, pair in enumerate(ahead(refined, pairs)):
+    for done, pair in enumerate(ahead(refined, map(frame, range(len(soft))), soft)):
         yield pair
         on_progress(done + 1, len(soft))
 
@@ -93,12 +92,12 @@ def _learn_background(frame: Callable[[int], Image], soft: Soft, scale: float) -
     first = _resized(frame(0), scale)
     count = int(np.clip(_MAX_BYTES // (first.size + 1), _MIN_SEEN, min(_FRAMES, len(soft))))
     chosen = spaced_indices(len(soft), count)
-    images = np.stack(list(ahead(lambda image: _resized(image, scale), (frame(int(k)) for k in chosen))))
+    images = np.stack(list(ahead(partial(_resized, to=scale), (frame(int(k)) for k in chosen))))
     network = [_resized(soft[int(k)], scale) for k in chosen]
     masks, background = [mask > 76 for mask in network], None
     for clearance in _CLEARANCES:
         if background is not None:
-            masks = [mask > 127 for mask in ahead(partial(_matted, background), zip(images, network))]
+            masks = [mask > 127 for mask in ahead(_matte, images, network, repeat(background))]
         background = _median(images, np.stack(list(ahead(partial(dilated, share=clearance), masks))))
         if background is None:
             return None
@@ -136,10 +135,6 @@ def _middle(values: Floats32, count: NDArray[np.int64]) -> Floats32:
     ranked = np.sort(values, axis=-1)
     low, high = (np.take_along_axis(ranked, k[..., None], -1)[..., 0] for k in ((count - 1) // 2, count // 2))
     return np.asarray((low + high) / 2, np.float32)
-
-
-def _matted(background: Background, pair: tuple[Image, Image]) -> Image:
-    return _matte(*pair, background)
 
 
 def _matte(image: Image, soft: Image, background: Background | None) -> Image:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from typing import Protocol
 
 import cv2
@@ -98,15 +99,15 @@ def observe(
     masks, person_alone, hidden = (GreyImages([], soft.image_size) for _ in range(3))
     second, outside = [], []
 
-    def look_again(one: tuple[int, tuple[Image, Image]]) -> tuple[Image, Image, Image, Views]:
-        k, (image, mask) = one
+    def look_again(k: int, pair: tuple[Image, Image]) -> tuple[Image, Image, Image, Views]:
+        image, mask = pair
         mask, behind = _apart(mask, soft[k], [other[k] for other in others])
         alone = _alone(image, np.maximum(mask, behind), first[k].region.size)
         again = networks.landmarks.look_twice(alone, first[k].region.scaled(_WIDER))
         return mask, behind, only_person(image, mask), again.without_mask()
 
     refined = refine_masks(lambda k: video.frame(frames[k]), soft, lambda k, n: on_progress("masks", k, n))
-    for k, (mask, behind, grey, views) in enumerate(ahead(look_again, enumerate(refined))):
+    for k, (mask, behind, grey, views) in enumerate(ahead(look_again, count(), refined)):
         masks.append(mask)
         hidden.append(behind)
         person_alone.append(grey)
@@ -180,9 +181,8 @@ def _merged(first: list[Views], second: list[Views], outside: Floats, seconds: F
 def _hands(
     video: Clip, frames: list[int], merged: Merged, network: HandNetwork, on_progress: OnProgress
 ) -> list[Hands]:
-    shown = ((video.frame(number), merged.points[k], merged.confidence[k]) for k, number in enumerate(frames))
     hands = []
-    for one in ahead(lambda frame: network(*frame), shown):
+    for one in ahead(network, map(video.frame, frames), merged.points, merged.confidence):
         hands.append(one)
         on_progress("hands", len(hands), len(frames))
     return hands
