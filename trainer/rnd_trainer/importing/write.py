@@ -110,7 +110,11 @@ def _without_background(linear: Floats32, coverage: Floats32) -> Floats32:
         return linear
     person, known = colour_around(linear, (coverage > 0) & (least > _COVERED), _REACH)
     behind, seen = colour_around(linear, coverage == 0, _REACH)
-    taken = np.minimum(1 - share_of_person(linear, person, behind), 1 - least)
-    share = (np.maximum(taken, 0) * ((known > 0) & (seen > 0)))[..., None]
-    own = linear + share * (person - behind)
-    return np.asarray(own + share * (person - own), np.float32)
+    edge = (least < 1) & (known > 0) & (seen > 0)
+    mixed, person, behind = linear[edge], person[edge], behind[edge]
+    taken = np.minimum(1 - share_of_person(mixed, person, behind), 1 - least[edge])
+    share = np.maximum(taken, 0)[:, None]
+    own = mixed + share * (person - behind)
+    result = linear.copy()
+    result[edge] = own + share * (person - own)
+    return result

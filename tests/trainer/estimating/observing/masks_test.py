@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rnd_trainer.checking.silhouette import mask_iou
-from rnd_trainer.estimating.observing.masks import _median, refine_masks
+from rnd_trainer.estimating.observing.masks import _learn, refine_masks
 
 HEIGHT, WIDTH, COUNT = 200, 160, 14
 
@@ -99,11 +99,15 @@ def test_an_empty_mask_stays_empty() -> None:
 def test_a_background_is_the_median_of_the_frames_that_show_it() -> None:
     rng = np.random.default_rng(3)
     images = np.clip(rng.integers(40, 200, (1, 6, 30, 3)) + rng.normal(0, 3, (11, 6, 30, 3)), 0, 255).astype(np.uint8)
-    hidden = rng.random((11, 6, 30)) < 0.4
+    first, hidden = rng.random((11, 6, 30)) < 0.6, rng.random((11, 6, 30)) < 0.4
     hidden[2:, 0, :5] = True
-    background = _median(images, hidden)
-    assert background is not None
-    np.testing.assert_array_equal(background.seen, (~hidden).sum(0) >= 3)
-    shown = np.where(hidden[..., None], np.nan, images)
-    expected = np.nanmedian(shown[:, background.seen], axis=0)
-    np.testing.assert_array_equal(background.colour[background.seen], expected)
+    hidden[:, 3:] = first[:, 3:]
+    colour, noise = np.zeros((6, 30, 3), np.float32), np.zeros((6, 30), np.float32)
+    _learn(images, first, np.ones((6, 30), bool), colour, noise)
+    _learn(images, hidden, (first != hidden).any(0), colour, noise)
+    seen = (~hidden).sum(0) >= 3
+    shown = np.where(hidden[..., None], np.nan, images)[:, seen]
+    expected = np.nanmedian(shown, axis=0)
+    np.testing.assert_array_equal(colour[seen], expected)
+    np.testing.assert_allclose(noise[seen], 1.48 * np.nanmedian(np.abs(shown - expected), axis=0).max(-1), rtol=1e-6)
+    assert not colour[~seen].any()

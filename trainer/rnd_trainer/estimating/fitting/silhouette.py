@@ -81,16 +81,24 @@ def _outline(
     mask: Image, hidden: Image | None, grid: tuple[int, int]
 ) -> tuple[NDArray[np.float32], Ints, NDArray[np.float32]]:
     """Distances from a mask on ``grid`` (width, height), its outlines' pixels [N, 2] and its slope there [N, 2]."""
-    allowed = _largest((mask if hidden is None else np.maximum(mask, hidden)) > 127)
-    binary = allowed & (mask > 127)
+    person = mask if hidden is None else np.maximum(mask, hidden)
+    blur = max(1.5, 0.004 * max(mask.shape))
+    x, y, wide, high = cv2.boundingRect(person)
+    margin = BORDER + int(5 * blur)
+    left, top = max(x - margin, 0), max(y - margin, 0)
+    window = slice(top, y + high + margin), slice(left, x + wide + margin)
+    allowed = np.zeros_like(mask)
+    allowed[window] = _largest(person[window] > 127)
+    binary = allowed[window] & (mask[window] > 127)
     away = cv2.resize(cv2.distanceTransform(1 - allowed, cv2.DIST_L2, 5), grid, interpolation=cv2.INTER_AREA)
     found, _ = cv2.findContours(binary, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     line = np.concatenate([np.zeros((0, 2), np.int64), *(line[:, 0] for line in found if len(line) > 30)])
     if hidden is not None:
-        line = line[cv2.dilate(hidden, np.ones((2 * BORDER + 1,) * 2, np.uint8))[line[:, 1], line[:, 0]] <= 127]
-    smooth = cv2.GaussianBlur(binary.astype(np.float32), (0, 0), max(1.5, 0.004 * max(mask.shape)))
+        near = cv2.dilate(hidden[window], np.ones((2 * BORDER + 1,) * 2, np.uint8))
+        line = line[near[line[:, 1], line[:, 0]] <= 127]
+    smooth = cv2.GaussianBlur(binary.astype(np.float32), (0, 0), blur)
     slope = np.stack([cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)], -1)
-    return away, line, slope[line[:, 1], line[:, 0]]
+    return away, line + (left, top), slope[line[:, 1], line[:, 0]]
 
 
 def _largest(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

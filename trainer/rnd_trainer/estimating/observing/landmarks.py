@@ -55,7 +55,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Views of one image: arrays over the V views, and the mean of their masks [H, W] in 0…1."""
+    """Views of one image: arrays over the V views, and the mean of their masks [H, W] in 0…1, or none, [0, 0]."""
 
     points: Floats  # [V, 33, 2]
     metres: Floats  # [V, 33, 3]
@@ -103,14 +103,18 @@ class LandmarkNetwork:
             to_image=to_image,
         )
 
-    def look_twice(self, image: Image, region: Region, first: View | None = None) -> Views:
+    def look_twice(
+        self, image: Image, region: Region, first: View | None = None, *, with_mask: bool = True
+    ) -> Views:
         """Two views of ``region``, as is and mirrored; ``first`` is the former where it has been taken."""
         shrunk = Shrunk(image, region.size, SIDE)
         plain = first or self.look(shrunk, region)
         views = [plain, self.look(shrunk, region, mirrored=True)]
-        size = image.shape[1], image.shape[0]
-        masks = [uncrop(view.mask, view.to_image, size) for view in views]
-        mask = np.asarray(np.mean(masks, axis=0), np.float32)
+        mask = np.zeros((0, 0), np.float32)
+        if with_mask:
+            size = image.shape[1], image.shape[0]
+            one, other = (uncrop(view.mask, view.to_image, size) for view in views)
+            mask = np.asarray((one + other) / 2, np.float32)
         return Views(
             points=np.stack([view.points for view in views]),
             metres=np.stack([view.metres for view in views]),

@@ -95,38 +95,51 @@ def _learn_background(frame: Callable[[int], Image], soft: Soft, scale: float) -
     images = np.stack(list(ahead(partial(_resized, to=scale), (frame(int(k)) for k in chosen))))
     network = [_resized(soft[int(k)], scale) for k in chosen]
     masks, background = [mask > 76 for mask in network], None
+    colour, noise = np.zeros(images.shape[1:], np.float32), np.zeros(images.shape[1:3], np.float32)
+    before = np.ones(images.shape[:3], np.bool_)
     for clearance in _CLEARANCES:
         if background is not None:
             masks = [mask > 127 for mask in ahead(_matte, images, network, repeat(background))]
-        background = _median(images, np.stack(list(ahead(partial(dilated, share=clearance), masks))))
+        hidden = np.stack(list(ahead(partial(dilated, share=clearance), masks)))
+        _learn(images, hidden, (hidden != before).any(0), colour, noise)
+        before = hidden
+        background = _background(colour, noise, (~hidden).sum(0) >= _MIN_SEEN)
         if background is None:
             return None
     return background
 
 
-def _median(images: NDArray[np.uint8], hidden: NDArray[np.bool_]) -> Background | None:
-    """Median and deviation over the frames in which a pixel is not hidden, row by row."""
+def _learn(
+    images: NDArray[np.uint8],
+    hidden: NDArray[np.bool_],
+    where: NDArray[np.bool_],
+    colour: Floats32,
+    noise: Floats32,
+) -> None:
+    """Put the median and the deviation over the frames in which a pixel is not hidden into ``colour`` and ``noise``."""
     shows = (~hidden).sum(0)
-    seen = shows >= _MIN_SEEN
-    colour = np.zeros(images.shape[1:], np.float32)
-    noise = np.zeros(images.shape[1:3], np.float32)
+    colour[where] = 0
+    where = where & (shows >= _MIN_SEEN)
 
     def learn(row: int) -> None:
-        columns = seen[row]
+        columns = where[row]
         count = shows[row, columns, None]
         shown = np.where(hidden[:, row, columns, None], np.float32(np.inf), images[:, row, columns])
         shown = np.ascontiguousarray(np.moveaxis(shown, 0, -1))
         colour[row, columns] = middle = _middle(shown, count)
         noise[row, columns] = 1.48 * _middle(np.abs(shown - middle[..., None]), count).max(-1)
 
-    deque(ahead(learn, np.flatnonzero(seen.any(1)).tolist()), maxlen=0)
+    deque(ahead(learn, np.flatnonzero(where.any(1)).tolist()), maxlen=0)
+
+
+def _background(colour: Floats32, noise: Floats32, seen: NDArray[np.bool_]) -> Background | None:
+    """What was seen of a background, or None where it moves."""
     if not seen.any():
         return None
     usual = float(np.median(noise[seen]))
     if usual > _MAX_NOISE:
         return None
-    noise[~seen] = usual
-    smooth = cv2.blur(noise, (5, 5))
+    smooth = cv2.blur(np.where(seen, noise, np.float32(usual)), (5, 5))
     return Background(colour, seen, np.maximum(smooth, max(usual, _MIN_NOISE)).astype(np.float32))
 
 
@@ -194,13 +207,15 @@ def _mixed(alpha: Floats32, pixels: Floats32, background: Background) -> Floats3
     """``alpha`` with the outline's pixels measured as mixtures of the person's colour nearby and the background's."""
     sure = cv2.erode((alpha > 0.95).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     person, weight = colour_around(pixels, sure, _COLOUR_REACH)
-    across = person - background.colour
-    contrast = np.vecdot(across, across)
-    share = share_of_person(pixels, person, background.colour)
-    trust = contrast / (contrast + (_MIN_CONTRAST * _deviation(background)) ** 2)
     edge = cv2.dilate((np.abs(alpha - 0.5) < 0.45).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    trust = np.where(edge & background.seen & (weight > 0.02), trust, 0)
-    return np.asarray((1 - trust) * alpha + trust * np.clip(share, 0, 1), np.float32)
+    edge &= background.seen & (weight > 0.02)
+    person, behind = person[edge], background.colour[edge]
+    contrast = np.vecdot(person - behind, person - behind)
+    share = np.clip(share_of_person(pixels[edge], person, behind), 0, 1)
+    trust = contrast / (contrast + (_MIN_CONTRAST * _deviation(background)[edge]) ** 2)
+    mixed = alpha.copy()
+    mixed[edge] = (1 - trust) * alpha[edge] + trust * share
+    return mixed
 
 
 def _resized(pixels: Image, to: float | tuple[int, int]) -> Image:

@@ -103,8 +103,8 @@ def observe(
         image, mask = pair
         mask, behind = _apart(mask, soft[k], [other[k] for other in others])
         alone = _alone(image, np.maximum(mask, behind), first[k].region.size)
-        again = networks.landmarks.look_twice(alone, first[k].region.scaled(_WIDER))
-        return mask, behind, only_person(image, mask), again.without_mask()
+        again = networks.landmarks.look_twice(alone, first[k].region.scaled(_WIDER), with_mask=False)
+        return mask, behind, only_person(image, mask), again
 
     refined = refine_masks(lambda k: video.frame(frames[k]), soft, lambda k, n: on_progress("masks", k, n))
     for k, (mask, behind, grey, views) in enumerate(ahead(look_again, count(), refined)):
@@ -193,7 +193,8 @@ def _alone(image: Image, mask: Image, size: float) -> Image:
     reach = 2 * max(1, round(_AROUND * size)) + 1
     plain = np.array(cv2.mean(image)[:3], np.float32)
     alone = np.empty_like(image)
-    alone[:] = plain
+    alone[0] = plain
+    alone[1:] = alone[0]  # bytes: many times as fast as floats everywhere
     left, top, width, height = cv2.boundingRect(mask)
     rows, columns = (slice(max(a - reach, 0), a + n + reach) for a, n in ((top, height), (left, width)))
     grown = cv2.dilate(mask[rows, columns], cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
@@ -207,9 +208,13 @@ def _outside(mask: Image, points: Floats) -> NDArray[np.float64]:
     person = (mask > 127).astype(np.uint8)
     if not person.any():
         return np.zeros(points.shape[:2])
-    distance = cv2.distanceTransform(1 - person, cv2.DIST_L2, 5)
     height, width = mask.shape
     columns = np.clip(points[..., 0].astype(int), 0, width - 1)
     rows = np.clip(points[..., 1].astype(int), 0, height - 1)
     beyond = np.hypot(points[..., 0] - columns, points[..., 1] - rows)
+    x, y, wide, high = cv2.boundingRect(person)
+    left, top = min(x, int(columns.min())), min(y, int(rows.min()))
+    right, bottom = max(x + wide, int(columns.max()) + 1), max(y + high, int(rows.max()) + 1)
+    columns, rows = columns - left, rows - top
+    distance = cv2.distanceTransform(1 - person[top:bottom, left:right], cv2.DIST_L2, 5)
     return np.asarray(distance[rows, columns] + np.maximum(beyond - 1.5, 0), np.float64)
