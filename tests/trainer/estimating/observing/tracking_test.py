@@ -36,24 +36,25 @@ def blocks(image: np.ndarray) -> list[Detection]:
 
 
 class Network:
-    """Sees the red block nearest to the region's middle."""
+    """Sees the red block nearest to the region's middle; a darker one may be a thing."""
 
     def look(self, image, region: Region, *, mirrored: bool = False) -> View:
         near = [one.region for one in blocks(image.image) if region.overlap(one.region) > 0.2]
         found = near[0] if near else region
         zeros = np.zeros((33, 2)), np.zeros((33, 3)), np.ones(33)
-        return View(*zeros, 1.0 if near else 0.0, found, np.zeros((SIDE, SIDE), np.float32), region.to_image(SIDE))
+        score = 0.0 if not near else 1.0 if image.image[round(found.y), round(found.x), 0] > 220 else 0.9
+        return View(*zeros, score, found, np.zeros((SIDE, SIDE), np.float32), region.to_image(SIDE))
 
     def look_twice(self, image: np.ndarray, region: Region, first: View | None = None) -> Views:
         many = np.zeros((2, 33, 2)), np.zeros((2, 33, 3)), np.ones((2, 33))
         return Views(*many, 1.0, np.zeros(image.shape[:2], np.float32), region)
 
 
-def image(*people: tuple[int, int], grey: int = 90) -> np.ndarray:
+def image(*people: tuple[int, int], grey: int = 90, red: int = 230) -> np.ndarray:
     """People at these columns with these heights."""
     pixels = np.full((120, 200, 3), grey, np.uint8)
     for x, height in people:
-        pixels[60 - height // 2 : 60 + height // 2, x - height // 6 : x + height // 6] = (230, 20, 20)
+        pixels[60 - height // 2 : 60 + height // 2, x - height // 6 : x + height // 6] = (red, 20, 20)
     return pixels
 
 
@@ -94,6 +95,13 @@ def test_a_person_is_chosen_among_all_that_the_message_counts() -> None:
     with pytest.raises(InputError, match=r"frame \d+: people: expected one, got 3 .* 1 at x = 80, 2 at x = 150"):
         start_of(images)
     assert [round(start_of(images, person=k).region.x) for k in range(3)] == [30, 80, 150]
+
+
+def test_a_thing_that_looks_like_a_person_is_nobody_beside_a_person() -> None:
+    person, thing = image((60, 60)), image((150, 56), red=210)
+    start = start_of([np.where(thing == 90, person, thing)] * COUNT)
+    assert (round(start.region.x), start.others) == (60, ())
+    assert round(start_of([thing] * COUNT).region.x) == 150
 
 
 def test_people_of_like_size_may_hide_the_person() -> None:

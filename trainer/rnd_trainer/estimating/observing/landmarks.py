@@ -103,9 +103,7 @@ class LandmarkNetwork:
             to_image=to_image,
         )
 
-    def look_twice(
-        self, image: Image, region: Region, first: View | None = None, *, with_mask: bool = True
-    ) -> Views:
+    def look_twice(self, image: Image, region: Region, first: View | None = None, *, with_mask: bool = True) -> Views:
         """Two views of ``region``, as is and mirrored; ``first`` is the former where it has been taken."""
         shrunk = Shrunk(image, region.size, SIDE)
         plain = first or self.look(shrunk, region)

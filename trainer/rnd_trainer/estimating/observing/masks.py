@@ -110,11 +110,7 @@ def _learn_background(frame: Callable[[int], Image], soft: Soft, scale: float) -
 
 
 def _learn(
-    images: NDArray[np.uint8],
-    hidden: NDArray[np.bool_],
-    where: NDArray[np.bool_],
-    colour: Floats32,
-    noise: Floats32,
+    images: NDArray[np.uint8], hidden: NDArray[np.bool_], where: NDArray[np.bool_], colour: Floats32, noise: Floats32
 ) -> None:
     """Put the median and the deviation over the frames in which a pixel is not hidden into ``colour`` and ``noise``."""
     shows = (~hidden).sum(0)

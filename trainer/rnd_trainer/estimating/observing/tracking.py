@@ -19,6 +19,7 @@ from .regions import Image, Region, Shrunk
 
 MIN_SCORE = 0.5
 """of the landmark network, that there is a person"""
+_SURE = 0.99  # score of people beside a surer one: things had up to 0.98, people 0.994 and more
 _SAMPLES = 9  # frames in which people are counted
 _ALIKE = 0.6  # size of a second person, relative to the first, from which one has to be chosen
 _OFTEN = 0.25  # share of the sampled frames
@@ -134,12 +135,13 @@ def _found_again(people: list[Detection], last: Region) -> Region | None:
 
 def _people(image: Image, detector: Detector, network: LandmarkNetwork) -> list[Region]:
     """Regions of all whom ``network`` confirms; candidates that lead it to one person count once."""
-    people: list[Region] = []
+    people: list[tuple[Region, float]] = []
     for one in detector(image):
         settled = _settled(image, one.region, network)
-        if settled is not None and not any(settled[0].same_person(other) for other in people):
-            people.append(settled[0])
-    return people
+        if settled is not None and not any(settled[0].same_person(other) for other, _ in people):
+            people.append((settled[0], settled[1].score))
+    sure = min(_SURE, max((score for _, score in people), default=0.0))
+    return [region for region, score in people if score >= sure]
 
 
 def _alike(people: list[Region]) -> list[Region]:
