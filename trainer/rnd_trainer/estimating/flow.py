@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.core.threads import ahead
+
 Image = NDArray[np.uint8]
+Masked = tuple[Image, Image]
+"""grey levels [H, W] and the person's mask [H, W]"""
 Floats32 = NDArray[np.float32]
 
 CELLS = 128
@@ -78,26 +82,29 @@ def flow_of(
         on_frame: called with how many are done.
     """
     gaps = sorted({min(max(1, round(seconds * rate)), MAX_GAP) for seconds in SECONDS})
-    pairs: dict[int, list[tuple[NDArray[np.float64], Floats32]]] = {gap: [] for gap in gaps}
-    before: deque[tuple[Image, Image]] = deque(maxlen=gaps[-1])
-    for k, mask in enumerate(masks):
-        here = np.asarray(cv2.cvtColor(frame(k), cv2.COLOR_RGB2GRAY), np.uint8), mask
-        for gap in gaps:
-            if gap <= len(before):
-                pairs[gap].append(_between(before[-gap], here))
-        before.append(here)
-        on_frame(k + 1)
+
+    def pairs() -> Iterator[tuple[int, Masked, Masked]]:
+        before: deque[Masked] = deque(maxlen=gaps[-1])
+        for k, mask in enumerate(masks):
+            here = np.asarray(cv2.cvtColor(frame(k), cv2.COLOR_RGB2GRAY), np.uint8), mask
+            yield from ((gap, before[-gap], here) for gap in gaps if gap <= len(before))
+            before.append(here)
+            on_frame(k + 1)
+
+    flows: dict[int, list[tuple[NDArray[np.float64], Floats32]]] = {gap: [] for gap in gaps}
+    for gap, flow in ahead(lambda pair: (pair[0], _between(*pair[1:])), pairs()):
+        flows[gap].append(flow)
     return tuple(
         Flow(
             gap,
             np.array([box for box, _ in found]).reshape(-1, 4),
             np.array([moved for _, moved in found], np.float16).reshape(-1, CELLS, CELLS, 2),
         )
-        for gap, found in pairs.items()
+        for gap, found in flows.items()
     )
 
 
-def _between(first: tuple[Image, Image], second: tuple[Image, Image]) -> tuple[NDArray[np.float64], Floats32]:
+def _between(first: Masked, second: Masked) -> tuple[NDArray[np.float64], Floats32]:
     """Box [4] and displacement [CELLS, CELLS, 2] from one (grey image, mask) to another."""
     height, width = first[0].shape
     x, y, wide, high = cv2.boundingRect((np.maximum(first[1], second[1]) > 127).astype(np.uint8))

@@ -41,6 +41,7 @@ from .observations import Observations
 from .observing.camera_motion import Steady, steady
 from .observing.frame_rate import Regular, regular
 from .observing.observe import MIN_FRAMES, Networks, observe
+from .opencv_threads import opencv_on_one_thread
 from .overlay import SIDE, write_overlay
 
 Floats = NDArray[np.float64]
@@ -58,6 +59,7 @@ def is_video_file(source: Path) -> bool:
     return source.is_file() and source.suffix.lower() in video_layout.SUFFIXES
 
 
+@opencv_on_one_thread()
 def import_video(
     source: Path,
     out: Path,

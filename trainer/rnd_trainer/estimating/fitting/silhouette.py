@@ -98,7 +98,7 @@ def _outline(
         line = line[near[line[:, 1], line[:, 0]] <= 127]
     smooth = cv2.GaussianBlur(binary.astype(np.float32), (0, 0), blur)
     slope = np.stack([cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)], -1)
-    return away, line + (left, top), slope[line[:, 1], line[:, 0]]
+    return away, line + np.array([left, top]), slope[line[:, 1], line[:, 0]]
 
 
 def _largest(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:

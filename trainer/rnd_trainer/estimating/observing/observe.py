@@ -15,6 +15,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.threads import ahead
 from rnd_trainer.estimating.flow import flow_of
 from rnd_trainer.estimating.observations import GreyImages, Observations, only_person
+from rnd_trainer.estimating.opencv_threads import opencv_on_one_thread
 from rnd_trainer.importing.surfaces.masks import dilated
 
 from .detection import Detector
@@ -65,6 +66,7 @@ class Networks:
         return cls(Detector(detector), LandmarkNetwork(landmarks), HandNetwork(hands))
 
 
+@opencv_on_one_thread()
 def observe(
     video: Clip,
     networks: Networks,
