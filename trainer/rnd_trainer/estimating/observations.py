@@ -37,7 +37,6 @@ TRUNK = [BLAZEPOSE.index(side + joint) for joint in ("shoulder", "hip") for side
 HAND_POINTS = 21
 """points of a hand: the wrist, then four of each finger from the thumb on, base to tip"""
 _SURE = 200  # of 255, a mask's value well inside of the person
-_LEVEL = 3  # zlib's, of a PNG: higher ones cost time and save little
 
 
 class Encoded(NamedTuple):
@@ -248,6 +247,6 @@ def _flow(archive: Npz, gap: int, count: int) -> Flow:
 def _encode(image: Image) -> Encoded:
     left, top, width, height = cv2.boundingRect(image)
     part = image[top : top + max(height, 1), left : left + max(width, 1)]
-    done, png = cv2.imencode(".png", part, [cv2.IMWRITE_PNG_COMPRESSION, _LEVEL])
+    done, png = cv2.imencode(".png", part)
     assert done
     return Encoded(bytes(png), left, top)
