@@ -10,7 +10,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_trainer.estimating.observing.detection import Detection
 from rnd_trainer.estimating.observing.landmarks import SIDE, View, Views
 from rnd_trainer.estimating.observing.regions import Region
-from rnd_trainer.estimating.observing.tracking import find_person, follow
+from rnd_trainer.estimating.observing.tracking import find_person, follow, next_other
 
 COUNT = 20
 
@@ -100,14 +100,23 @@ def test_a_person_is_chosen_among_all_that_the_message_counts() -> None:
 def test_a_thing_that_looks_like_a_person_is_nobody_beside_a_person() -> None:
     person, thing = image((60, 60)), image((150, 56), red=210)
     start = start_of([np.where(thing == 90, person, thing)] * COUNT)
-    assert (round(start.region.x), start.others) == (60, ())
+    assert round(start.region.x) == 60 and all(len(people) == 1 for people in start.people.values())
     assert round(start_of([thing] * COUNT).region.x) == 150
 
 
 def test_people_of_like_size_may_hide_the_person() -> None:
     images = [image((30, 20), (80, 60), (150, 56))] * COUNT
-    assert [round(one.x) for one in start_of(images, person=1).others] == [150]
-    assert start_of([image((60, 80), (150, 30))] * COUNT).others == ()
+    start = start_of(images, person=1)
+    person = dict.fromkeys(range(COUNT), start.region)
+    other = next_other(start, [person])
+    assert other is not None and round(other.region.x) == 150
+    assert next_other(start, [person, dict.fromkeys(range(COUNT), other.region)]) is None
+
+
+def test_who_comes_later_may_hide_the_person_too() -> None:
+    start = start_of([image((60, 80))] * 15 + [image((60, 80), (150, 70))] * 4)
+    other = next_other(start, [dict.fromkeys(range(19), start.region)])
+    assert other is not None and other.frame >= 15 and round(other.region.x) == 150
 
 
 def test_several_detections_of_one_person_are_one_person() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import count
 from typing import Protocol
@@ -25,7 +25,7 @@ from .masks import refine_masks
 from .networks import open_network
 from .regions import Floats, Image, Region
 from .sides import Merged, merge_views
-from .tracking import Frames, Start, find_person, follow
+from .tracking import Frames, Start, find_person, follow, next_other
 
 OnProgress = Callable[[str, int, int], None]
 """called with (phase, done, total)"""
@@ -97,7 +97,7 @@ def observe(
     if len(frames) < MIN_FRAMES:
         raise InputError("frames with the person in view", expected=f"at least {MIN_FRAMES}", got=len(frames))
     regions = {number: views.region for number, views in zip(frames, first)}
-    others = [_other(video, numbers, Start(start.frame, one), networks, regions, on_progress) for one in start.others]
+    others = _others(video, numbers, start, regions, networks, on_progress)
     masks, person_alone, hidden = (GreyImages([], soft.image_size) for _ in range(3))
     second, outside = [], []
 
@@ -136,22 +136,29 @@ def observe(
     )
 
 
-def _other(
+def _others(
     video: Clip,
     numbers: list[int],
     start: Start,
+    regions: dict[int, Region],
     networks: Networks,
-    regions: Mapping[int, Region],
     on_progress: OnProgress,
-) -> GreyImages:
-    """Masks of who is at ``start`` in the frames of ``regions``, the followed person's; black where they are one."""
-    masks = GreyImages([], (video.width, video.height))
-    for done, (number, views) in enumerate(follow(video, numbers, start, networks.detector, networks.landmarks)):
-        on_progress("other people", done + 1, len(numbers))
-        if number in regions:
-            here = None if views is None or views.region.same_person(regions[number]) else views.mask
-            masks.append(np.zeros(masks.shape[1:], np.uint8) if here is None else _bytes(here))
-    return masks
+) -> list[GreyImages]:
+    """Masks of each who may hide the person, in the frames of ``regions``, the person's; black where they are one."""
+    others, tracks = [], [regions]
+    while other := next_other(start, tracks):
+        masks, track = GreyImages([], (video.width, video.height)), {}
+        for done, (number, views) in enumerate(follow(video, numbers, other, networks.detector, networks.landmarks)):
+            on_progress("other people", done + 1, len(numbers))
+            if number not in regions:
+                continue
+            mask = np.zeros(masks.shape[1:], np.uint8)
+            if views is not None and not views.region.same_person(regions[number]):
+                mask, track[number] = _bytes(views.mask), views.region
+            masks.append(mask)
+        others.append(masks)
+        tracks.append({**track, other.frame: other.region})
+    return others
 
 
 def _bytes(mask: NDArray[np.float32]) -> Image:

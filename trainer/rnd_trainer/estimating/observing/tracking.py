@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from statistics import mode
 from typing import NamedTuple, Protocol
 
@@ -38,11 +38,11 @@ class Frames(Protocol):
 
 @dataclass(frozen=True)
 class Start:
-    """Where the person is first seen, and people there who may hide the person."""
+    """Where a person is first seen, and all people in the frames in which they were counted."""
 
     frame: int
     region: Region
-    others: tuple[Region, ...] = ()
+    people: Mapping[int, list[Region]] = field(default_factory=dict)
 
 
 def find_person(
@@ -68,17 +68,29 @@ def find_person(
     if person is not None:
         if person >= len(row):
             raise InputError("--person", expected=f"0 to {len(row) - 1}, counted from the left", got=person)
-        return _start(number, row[person], row)
+        return Start(number, row[person], seen)
     if len(several) > _OFTEN * len(seen):
         places = ", ".join(f"{k} at x = {one.x:.0f}" for k, one in enumerate(row))
         raise InputError(
             "people", expected="one", got=f"{len(row)}", frame=number, hint=f"choose by --person: {places}"
         )
-    return _start(number, seen[number][0], row)
+    return Start(number, seen[number][0], seen)
 
 
-def _start(frame: int, person: Region, people: list[Region]) -> Start:
-    return Start(frame, person, tuple(one for one in people if one is not person and one.size >= _ALIKE * person.size))
+def next_other(start: Start, tracks: Sequence[Mapping[int, Region]]) -> Start | None:
+    """Where somebody is seen who may hide the person of the first of ``tracks`` and is on none; None where nobody is.
+
+    ``tracks`` are regions by frame number. Where the person was not counted, nobody was counted well.
+    """
+    for number, people in start.people.items():
+        person = tracks[0].get(number)
+        if person is None or not any(person.same_person(one) for one in people):
+            continue
+        known = [track[number] for track in tracks if number in track]
+        for one in people:
+            if one.size >= _ALIKE * person.size and not any(one.same_person(other) for other in known):
+                return Start(number, one)
+    return None
 
 
 def follow(
