@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from rnd_trainer.estimating.observing.observe import _apart
+from rnd_trainer.estimating.observing.observe import _apart, _outside
 
 
 def disc(x: int) -> np.ndarray:
@@ -21,3 +21,10 @@ def test_a_mask_ends_where_somebody_else_begins() -> None:
     assert not (np.minimum(mask, hidden) > 127).any()
     alone, nothing = _apart(spilled, mine, [])
     assert alone is spilled and not nothing.any()
+
+
+def test_distances_from_the_person_go_on_beyond_the_image() -> None:
+    points = np.array([[[40.5, 50.5], [100.5, 50.5], [4.5, 2.5], [200.0, 50.5]]])
+    expected = np.maximum(np.hypot(points[..., 0] - 40.5, points[..., 1] - 50.5) - 30, 0)
+    np.testing.assert_allclose(_outside(disc(40), points), expected, atol=2)
+    assert not _outside(np.zeros((100, 140), np.uint8), points).any()
