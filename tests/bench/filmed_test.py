@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from rnd_bench.lifter.pose2sim import Calibrated
 from rnd_bench.studies.film_truth import WHAM_PA_MM, _placed, exact_poses, in_capture_of, wham_like
+from rnd_bench.studies.filmed import EXACT, METHODS, WHAM, Film
 from rnd_bench.studies.video import LIMBS, pa_mm
 from rnd_runtime.capture.capture import Capture
 from rnd_runtime.core.camera import Camera
@@ -100,3 +101,10 @@ def test_another_camera_stands_where_it_was_in_a_world_of_another_size() -> None
     camera = _placed(other, here, size, own, (600, 800))  # type: ignore[arg-type]
     found = (camera.world_to_camera @ inside)[:3]
     np.testing.assert_allclose(found, size * (other.rotation @ point + other.translation), atol=1e-9)
+
+
+def test_a_film_is_trained_by_the_methods_that_are_for_it(truth, imported) -> None:
+    every = (*METHODS, EXACT, WHAM)
+    assert Film("rendered", imported, truth, truth).methods(every) == [*METHODS, EXACT]
+    assert Film("cam01", imported, truth).methods(every) == [*METHODS, WHAM]
+    assert Film("cam03", imported, truth).methods((WHAM,)) == []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -61,6 +61,11 @@ class Film:
     scored: Capture
     exact: Capture | None = None
 
+    def methods(self, wanted: Sequence[StudyRow]) -> list[StudyRow]:
+        """Those of ``wanted`` that are for this film: exact poses where there are some, noise in one real film."""
+        here = {EXACT.name: self.exact is not None, WHAM.name: self.name == SCORED[0]}
+        return [method for method in wanted if here.get(method.name, True)]
+
 
 def run(options: Filmed) -> None:
     """Import, train, score; print the table, write the rows."""
@@ -69,6 +74,7 @@ def run(options: Filmed) -> None:
         output_file(options.json)
     if (options.capture is None) != (options.video is None):
         raise InputError("--capture and --video", expected="both or neither", got="one")
+    wanted = chosen((*METHODS, EXACT, WHAM), options.methods)
     config = resized(preset("quick"), options.gaussians, options.steps)
     config = replace(config, image_scale=options.image_scale, unseen_fraction=0.0, hold_out=options.hold_out)
     perceptual = load_lpips(options.perceptual_weights)
@@ -76,8 +82,7 @@ def run(options: Filmed) -> None:
     rows: list[dict[str, Any]] = []
     with Progress() as progress:
         for film in _films(options, out, progress):
-            compared = (EXACT,) if film.exact else (WHAM,) if film.name == SCORED[0] else ()
-            for method in chosen((*METHODS, *compared), options.methods):
+            for method in film.methods(wanted):
                 progress.phase(f"{film.name}: {method.name}", 1)
                 rows += _rows(film, method, config, out, (perceptual, judge), progress.update)
     if options.json is not None:
