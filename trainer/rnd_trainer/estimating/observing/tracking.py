@@ -19,7 +19,7 @@ from .regions import Image, Region, Shrunk
 
 MIN_SCORE = 0.5
 """of the landmark network, that there is a person"""
-_SURE = 0.99  # score of people beside a surer one: things had up to 0.98, people 0.994 and more
+_SURE = 0.99  # score of people beside a surer one: things had up to 0.98, nearly all people more than 0.99
 _SAMPLES = 9  # frames in which people are counted
 _ALIKE = 0.6  # size of a second person, relative to the first, from which one has to be chosen
 _OFTEN = 0.25  # share of the sampled frames
