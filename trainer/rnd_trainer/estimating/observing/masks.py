@@ -206,7 +206,8 @@ def _mixed(alpha: Floats32, pixels: Floats32, background: Background) -> Floats3
     edge = cv2.dilate((np.abs(alpha - 0.5) < 0.45).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     edge &= background.seen & (weight > 0.02)
     person, behind = person[edge], background.colour[edge]
-    contrast = np.vecdot(person - behind, person - behind)
+    across = person - behind
+    contrast = np.vecdot(across, across)
     share = np.clip(share_of_person(pixels[edge], person, behind), 0, 1)
     trust = contrast / (contrast + (_MIN_CONTRAST * _deviation(background)[edge]) ** 2)
     mixed = alpha.copy()
